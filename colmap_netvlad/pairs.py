@@ -1,0 +1,163 @@
+"""Rankings -> a set of image pairs, and pairs lists on disk."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from colmap_netvlad.errors import InputError
+from colmap_netvlad.files import write_atomically
+from colmap_netvlad.retrieval.ranking import NO_PARTNER, Ranking
+
+FORMATS = ("colmap", "csv", "json")
+
+
+@dataclass(frozen=True)
+class ImagePair:
+    """Two images that are to be matched.
+
+    Attributes:
+        name1, name2: image names; `name1` comes first in the database's order.
+        score: the higher of the two scores that the images give each other.
+        rank: the better (lower) of the two ranks, from 1.
+    """
+
+    name1: str
+    name2: str
+    score: float
+    rank: int
+
+
+def check_k(k: int, num_images: int) -> int:
+    """Return `k` clamped to the number of possible partners.
+
+    Raises:
+        InputError: `k` is not positive, or there are fewer than two images.
+    """
+    if k < 1:
+        raise InputError(f"--k is {k}; it is the number of partners of each image, at least 1.")
+    if num_images < 2:
+        raise InputError(
+            f"The database has {num_images} image{'s' if num_images != 1 else ''}; "
+            "a pair needs two. Import the photos with `colmap-netvlad features`."
+        )
+    return min(k, num_images - 1)
+
+
+def union_of_top(ranking: Ranking, k: int) -> list[ImagePair]:
+    """Return the union of every image's own `k` best partners.
+
+    Each pair once, no self pairs, in the database's order of its images. Taking every image's
+    own list before removing duplicates keeps images late in the database from being starved.
+    """
+    best: dict[tuple[int, int], tuple[float, int]] = {}
+    cut = ranking.top(k)
+    for i, (row, scores) in enumerate(zip(cut.partners.tolist(), cut.scores.tolist(), strict=True)):
+        for rank, (j, score) in enumerate(zip(row, scores, strict=True), start=1):
+            if j == NO_PARTNER:
+                break
+            key = (min(i, j), max(i, j))
+            old_score, old_rank = best.get(key, (score, rank))
+            best[key] = (max(score, old_score), min(rank, old_rank))
+    names = ranking.names
+    return [ImagePair(names[i], names[j], *best[i, j]) for i, j in sorted(best)]
+
+
+def write_pairs(path: Path, pairs: Sequence[ImagePair], format: str = "colmap") -> list[str]:
+    """Write a pairs list whole or not at all, and return the names it could not hold.
+
+    COLMAP's list splits a line on its first space, so a name with a space (or one that starts
+    with `#`) cannot stand in it: such pairs are left out of that format and their names
+    returned. CSV and JSON hold every name and the scores.
+    """
+    text, unwritable = _TEXT[format](pairs)
+    write_atomically(path, text)
+    return unwritable
+
+
+def read_pairs(path: Path, names: Collection[str]) -> list[tuple[str, str]]:
+    """Read a pairs list in any of our formats (known by its suffix, else COLMAP's).
+
+    Pairs twice in either order are taken once; blank lines and lines starting with `#` are
+    skipped as COLMAP does.
+
+    Raises:
+        InputError: the file is missing or malformed, or names an image not in `names`.
+    """
+    if not path.is_file():
+        raise InputError(f"The pairs list {path} does not exist; `colmap-netvlad pairs` makes it.")
+    try:
+        raw = _READERS.get(path.suffix, _read_colmap)(path.read_text(encoding="utf-8"))
+    except (ValueError, KeyError, TypeError) as fault:
+        raise InputError(f"{path} is not a pairs list: {fault}.") from fault
+    known = set(names)
+    unknown = sorted({name for pair in raw for name in pair} - known)
+    if unknown:
+        raise InputError(
+            f"{path} names {len(unknown)} image{'s' if len(unknown) > 1 else ''} that the database "
+            f"does not have (first: {unknown[0]}); make the list from this database."
+        )
+    unique: dict[frozenset[str], tuple[str, str]] = {}
+    for a, b in raw:
+        if a != b:
+            unique.setdefault(frozenset((a, b)), (a, b))
+    return list(unique.values())
+
+
+def in_colmap_list(name: str) -> bool:
+    """Whether COLMAP's pairs list can express an image name."""
+    return not (name.startswith("#") or any(c.isspace() for c in name))
+
+
+def _colmap_text(pairs: Iterable[ImagePair]) -> tuple[str, list[str]]:
+    lines, unwritable = [], set()
+    for pair in pairs:
+        bad = [name for name in (pair.name1, pair.name2) if not in_colmap_list(name)]
+        unwritable.update(bad)
+        if not bad:
+            lines.append(f"{pair.name1} {pair.name2}\n")
+    return "".join(lines), sorted(unwritable)
+
+
+def _csv_text(pairs: Iterable[ImagePair]) -> tuple[str, list[str]]:
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(["name1", "name2", "score", "rank"])
+    writer.writerows([p.name1, p.name2, f"{p.score:.6g}", p.rank] for p in pairs)
+    return out.getvalue(), []
+
+
+def _json_text(pairs: Iterable[ImagePair]) -> tuple[str, list[str]]:
+    rows = [
+        {"name1": p.name1, "name2": p.name2, "score": round(p.score, 6), "rank": p.rank}
+        for p in pairs
+    ]
+    return json.dumps(rows, indent=1, ensure_ascii=False) + "\n", []
+
+
+def _read_colmap(text: str) -> list[tuple[str, str]]:
+    pairs = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        words = line.split()
+        if len(words) != 2:
+            raise ValueError(f"line {number} has {len(words)} names, not 2")
+        pairs.append((words[0], words[1]))
+    return pairs
+
+
+def _read_csv(text: str) -> list[tuple[str, str]]:
+    return [(row["name1"], row["name2"]) for row in csv.DictReader(io.StringIO(text))]
+
+
+def _read_json(text: str) -> list[tuple[str, str]]:
+    return [(row["name1"], row["name2"]) for row in json.loads(text)]
+
+
+_TEXT = {"colmap": _colmap_text, "csv": _csv_text, "json": _json_text}
+_READERS = {".csv": _read_csv, ".json": _read_json}

@@ -1,0 +1,105 @@
+"""Where things are: the database, the photos, what we keep beside them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from colmap_netvlad.errors import InputError
+
+DATABASE_NAMES = ("project.db", "database.db")
+"""What a COLMAP workspace calls its database, in the order they are looked for."""
+
+
+@dataclass(frozen=True)
+class Project:
+    """A COLMAP workspace: the user's database and photos, and the paths of what we write.
+
+    Attributes:
+        database: the COLMAP database; it exists.
+        images: the folder that image names are relative to, or None where it is not known
+            (methods that need only features still run).
+    """
+
+    database: Path
+    images: Path | None
+
+    @property
+    def folder(self) -> Path:
+        """The workspace: the database's folder."""
+        return self.database.parent
+
+    @property
+    def cache(self) -> Path:
+        """Our own sqlite file: descriptors, rankings, settings (`project.netvlad.db`)."""
+        return self.database.with_suffix(".netvlad.db")
+
+    @property
+    def pairs(self) -> Path:
+        """Where `pairs` writes by default."""
+        return self.folder / "pairs.txt"
+
+    @property
+    def sparse(self) -> Path:
+        """Where COLMAP keeps its models: `sparse/0`, `sparse/1`, ..."""
+        return self.folder / "sparse"
+
+    def need_images(self) -> Path:
+        """Return the photo folder.
+
+        Raises:
+            InputError: it is not known, or not there.
+        """
+        if self.images is None:
+            raise InputError(
+                f"No photo folder is known for {self.database}: there is no "
+                f"{self.folder / 'images'}; say where the photos are with --images."
+            )
+        if not self.images.is_dir():
+            raise InputError(f"The photo folder {self.images} does not exist; mend --images.")
+        return self.images
+
+
+def locate_database(database: Path | None, folder: Path | None = None) -> Path:
+    """Find the database: the given one, or `project.db` or `database.db` in `folder`.
+
+    Raises:
+        InputError: there is none.
+    """
+    if database is None:
+        folder = folder or Path.cwd()
+        found = [folder / name for name in DATABASE_NAMES if (folder / name).is_file()]
+        if not found:
+            raise InputError(
+                f"No {' or '.join(DATABASE_NAMES)} in {folder}; name the database with --db."
+            )
+        return found[0]
+    if not database.exists():
+        raise InputError(f"The database {database} does not exist; mend --db.")
+    if database.is_dir():
+        raise InputError(f"{database} is a folder; --db names the database file in it.")
+    return database
+
+
+def open_project(
+    database: Path | None, images: Path | None = None, remembered: Path | None = None
+) -> Project:
+    """Locate a project.
+
+    Args:
+        database: the COLMAP database, or None to look in the current folder.
+        images: the photo folder; default: `remembered` (from the cache), else `images/`
+            beside the database where it is a folder.
+
+    Raises:
+        InputError: no database, or a photo folder was given that does not exist.
+    """
+    database = locate_database(database)
+    if images is not None:
+        if not images.is_dir():
+            raise InputError(f"The photo folder {images} does not exist; mend --images.")
+        return Project(database, images)
+    for folder in (remembered, database.parent / "images"):
+        if folder is not None and folder.is_dir():
+            return Project(database, folder)
+    return Project(database, None)

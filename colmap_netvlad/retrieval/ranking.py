@@ -1,0 +1,70 @@
+"""The result of every retrieval method: for each image an ordered list of partners."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+NO_PARTNER = -1
+"""Fills a row of `Ranking.partners` after its last partner."""
+
+
+@dataclass(frozen=True, eq=False)
+class Ranking:
+    """For every image an ordered list of partners with scores.
+
+    Attributes:
+        names: N image names, relative to the photo folder, in the database's order.
+        partners: (N, K) int32, indices into `names`, best first; never the image itself,
+            no partner twice; `NO_PARTNER` after the last one.
+        scores: (N, K) float32, higher is more similar, comparable within a row; -inf where
+            there is no partner.
+        method: the method's name in the table of methods.
+        seconds_describe: T_fe of the paper's eq. 20: describing the images, s.
+        seconds_search: T_nns of eq. 20: searching the neighbours, s.
+        notes: sentences for the report (which vocabulary tree, which photos were left out).
+    """
+
+    names: tuple[str, ...]
+    partners: NDArray[np.int32]
+    scores: NDArray[np.float32]
+    method: str
+    seconds_describe: float = 0.0
+    seconds_search: float = 0.0
+    notes: tuple[str, ...] = field(default=())
+
+    def __post_init__(self) -> None:
+        shape = (len(self.names), self.partners.shape[1])
+        if self.partners.shape != shape or self.scores.shape != shape:
+            raise ValueError(
+                f"partners {self.partners.shape} and scores {self.scores.shape} "
+                f"do not fit {len(self.names)} images"
+            )
+
+    @property
+    def depth(self) -> int:
+        """K, the number of partners kept for an image."""
+        return int(self.partners.shape[1])
+
+    def top(self, k: int) -> Ranking:
+        """Return the ranking cut to the first `k` partners of each image."""
+        return replace(self, partners=self.partners[:, :k], scores=self.scores[:, :k])
+
+
+def from_lists(
+    names: tuple[str, ...],
+    lists: list[list[tuple[int, float]]],
+    method: str,
+    **times_and_notes: object,
+) -> Ranking:
+    """Build a ranking from ragged lists of (partner index, score), best first."""
+    depth = max((len(row) for row in lists), default=0)
+    partners = np.full((len(names), depth), NO_PARTNER, dtype=np.int32)
+    scores = np.full((len(names), depth), -np.inf, dtype=np.float32)
+    for i, row in enumerate(lists):
+        for rank, (partner, score) in enumerate(row):
+            partners[i, rank] = partner
+            scores[i, rank] = score
+    return Ranking(names, partners, scores, method, **times_and_notes)  # type: ignore[arg-type]
