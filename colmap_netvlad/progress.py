@@ -22,6 +22,10 @@ console = Console(stderr=True)
 """Progress and warnings go to standard error, so that standard output stays a clean report."""
 
 
+verbose = False
+"""Whether pycolmap's own log is let through (the commands' -v)."""
+
+
 class Step(Protocol):
     """One unit of work under way."""
 
