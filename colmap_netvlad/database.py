@@ -25,6 +25,9 @@ from colmap_netvlad.files import atomic_path
 MAX_NUM_IMAGES = 2147483647
 """COLMAP's factor in `pair_id = MAX_NUM_IMAGES * min(id1, id2) + max(id1, id2)`."""
 
+BUSY_SECONDS = 5.0
+"""How long a read waits for another process's write, s; COLMAP itself waits not at all."""
+
 SIFT_BYTES = 128
 """Bytes of one SIFT descriptor; `descriptors.cols` counts bytes."""
 
@@ -222,7 +225,7 @@ def _connect(path: Path) -> sqlite3.Connection:
     if not path.is_file():
         raise InputError(f"The database {path} does not exist; mend --db.")
     uri = f"{path.resolve().as_uri()}?mode=ro"
-    connection = sqlite3.connect(uri, uri=True, timeout=5, check_same_thread=False)
+    connection = sqlite3.connect(uri, uri=True, timeout=BUSY_SECONDS, check_same_thread=False)
     try:
         tables = _tables(connection)
     except sqlite3.OperationalError as fault:

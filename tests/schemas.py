@@ -1,0 +1,77 @@
+"""Empty COLMAP databases of every schema from 3.8 to 4.2, made without pycolmap.
+
+The statements follow COLMAP's published schemas; only what differs between versions is varied.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+
+VERSIONS = ("3.9", "3.10", "3.11", "3.12", "4.1", "4.2")
+
+_CAMERAS = """CREATE TABLE cameras (camera_id INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL,
+ model INTEGER NOT NULL, width INTEGER NOT NULL, height INTEGER NOT NULL, params BLOB,
+ prior_focal_length INTEGER NOT NULL)"""
+_IMAGES = """CREATE TABLE images (image_id INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL,
+ name TEXT NOT NULL UNIQUE, camera_id INTEGER NOT NULL{priors},
+ FOREIGN KEY(camera_id) REFERENCES cameras(camera_id))"""
+_LEGACY_PRIORS = ", " + ", ".join(
+    f"prior_{name} REAL" for name in ("qw", "qx", "qy", "qz", "tx", "ty", "tz")
+)
+_KEYPOINTS = """CREATE TABLE keypoints (image_id INTEGER PRIMARY KEY NOT NULL,
+ rows INTEGER NOT NULL,
+ cols INTEGER NOT NULL, data BLOB,
+ FOREIGN KEY(image_id) REFERENCES images(image_id) ON DELETE CASCADE)"""
+_DESCRIPTORS = """CREATE TABLE descriptors (image_id INTEGER PRIMARY KEY NOT NULL,{type}
+ rows INTEGER NOT NULL, cols INTEGER NOT NULL, data BLOB,
+ FOREIGN KEY(image_id) REFERENCES images(image_id) ON DELETE CASCADE)"""
+_MATCHES = """CREATE TABLE matches (pair_id INTEGER PRIMARY KEY NOT NULL, rows INTEGER NOT NULL,
+ cols INTEGER NOT NULL, data BLOB)"""
+_GEOMETRIES = """CREATE TABLE two_view_geometries (pair_id INTEGER PRIMARY KEY NOT NULL,
+ rows INTEGER NOT NULL, cols INTEGER NOT NULL, data BLOB, config INTEGER NOT NULL,
+ F BLOB, E BLOB, H BLOB, qvec BLOB, tvec BLOB{cameras})"""
+_PRIORS_BY_IMAGE = """CREATE TABLE pose_priors (image_id INTEGER PRIMARY KEY NOT NULL,
+ position BLOB, coordinate_system INTEGER NOT NULL{covariance},
+ FOREIGN KEY(image_id) REFERENCES images(image_id) ON DELETE CASCADE)"""
+_PRIORS_BY_SENSOR_DATA = """CREATE TABLE pose_priors (pose_prior_id INTEGER PRIMARY KEY NOT NULL,
+ corr_data_id INTEGER NOT NULL, corr_sensor_id INTEGER NOT NULL, corr_sensor_type INTEGER NOT NULL,
+ position BLOB, position_covariance BLOB, gravity BLOB, coordinate_system INTEGER NOT NULL)"""
+_RIGS = (
+    """CREATE TABLE rigs (rig_id INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL,
+ ref_sensor_id INTEGER NOT NULL, ref_sensor_type INTEGER NOT NULL)""",
+    """CREATE TABLE rig_sensors (rig_id INTEGER NOT NULL, sensor_id INTEGER NOT NULL,
+ sensor_type INTEGER NOT NULL, sensor_from_rig BLOB)""",
+    """CREATE TABLE frames (frame_id INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL,
+ rig_id INTEGER NOT NULL)""",
+    """CREATE TABLE frame_data (frame_id INTEGER NOT NULL, data_id INTEGER NOT NULL,
+ sensor_id INTEGER NOT NULL, sensor_type INTEGER NOT NULL)""",
+)
+
+
+def make_database(path: Path, version: str) -> None:
+    """Write an empty database of a COLMAP version in `VERSIONS`."""
+    number = tuple(int(part) for part in version.split("."))
+    four = number >= (4, 0)
+    statements = [
+        _CAMERAS,
+        _IMAGES.format(priors=_LEGACY_PRIORS if number < (3, 10) else ""),
+        _KEYPOINTS,
+        _DESCRIPTORS.format(type=" type INTEGER NOT NULL," if four else ""),
+        _MATCHES,
+        _GEOMETRIES.format(cameras=", camera1 BLOB, camera2 BLOB" if number >= (4, 2) else ""),
+    ]
+    if four:
+        statements.append(_PRIORS_BY_SENSOR_DATA)
+    elif number >= (3, 10):
+        covariance = ", position_covariance BLOB" if number >= (3, 11) else ""
+        statements.append(_PRIORS_BY_IMAGE.format(covariance=covariance))
+    if number >= (3, 12):
+        statements.extend(_RIGS)
+    user_version = number[0] * 10**6 + number[1] * 10**4 if four else 3900
+    with closing(sqlite3.connect(path)) as connection:
+        for statement in statements:
+            connection.execute(statement)
+        connection.execute(f"PRAGMA user_version = {user_version}")
+        connection.commit()
