@@ -1,0 +1,110 @@
+"""How good a retrieval is: accuracy, recall, average precision, efficiency (section 4.1.2)."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Collection, Iterable, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from colmap_netvlad.database import open_database
+from colmap_netvlad.retrieval.ranking import NO_PARTNER, Ranking
+
+CORRECT_MATCHES = 15
+"""A pair is correct with MORE verified matches than this (section 4.1.2)."""
+
+Pair = tuple[str, str]
+"""Two image names in alphabetical order: the key of a pair in every set and table here."""
+
+
+def as_pair(name1: str, name2: str) -> Pair:
+    """Return the pair of two images, the same whatever their order."""
+    return (name1, name2) if name1 <= name2 else (name2, name1)
+
+
+def verified_by_name(database: Path) -> dict[Pair, int]:
+    """Return the verified (inlier) matches of every pair tried in a COLMAP database.
+
+    Pairs that were tried and failed have 0.
+
+    Raises:
+        InputError: the database cannot be read.
+    """
+    with open_database(database) as opened:
+        names = {row.image_id: row.name for row in opened.images()}
+        counts = opened.verified_matches()
+    return {as_pair(names[a], names[b]): count for (a, b), count in counts.items()}
+
+
+def correct_pairs(verified: Mapping[Pair, int], more_than: int = CORRECT_MATCHES) -> set[Pair]:
+    """Return the pairs with more than `more_than` verified matches."""
+    return {as_pair(*pair) for pair, count in verified.items() if count > more_than}
+
+
+def accuracy(pairs: Iterable[tuple[str, str]], verified: Mapping[Pair, int]) -> float:
+    """Return eq. 19, N(MP) / N(RP): the share of the retrieved pairs that is correct, 0..1.
+
+    Args:
+        pairs: the retrieved pairs RP, in either order; a pair given twice counts once.
+        verified: verified matches by pair; a pair that is not in it has none.
+
+    Returns:
+        NaN where nothing was retrieved.
+    """
+    retrieved = {as_pair(*pair) for pair in pairs}
+    return _share(len(retrieved & correct_pairs(verified)), len(retrieved))
+
+
+def recall(pairs: Iterable[tuple[str, str]], truth: Collection[tuple[str, str]]) -> float:
+    """Return the share of the true pairs that was retrieved, 0..1 (NaN where there is no truth).
+
+    Args:
+        pairs: the retrieved pairs, in either order.
+        truth: the correct pairs of the scene (`correct_pairs` of an exhaustive matching).
+    """
+    retrieved = {as_pair(*pair) for pair in pairs}
+    wanted = {as_pair(*pair) for pair in truth}
+    return _share(len(retrieved & wanted), len(wanted))
+
+
+def average_precisions(ranking: Ranking, truth: Collection[tuple[str, str]]) -> dict[str, float]:
+    """Return the average precision (0..1) of every image that has a true partner.
+
+    AP is the mean, over the true partners of an image, of the precision of its list down to that
+    partner; a true partner that is not in the list gives 0. Of a list of K partners an image can
+    show K at most, so the mean is over min(true partners, K): a full ranking has the textbook's
+    value, a cut one the usual AP at K.
+    """
+    partners_of: dict[str, set[str]] = defaultdict(set)
+    for name1, name2 in truth:
+        partners_of[name1].add(name2)
+        partners_of[name2].add(name1)
+    index = {name: i for i, name in enumerate(ranking.names)}
+    precisions = {}
+    for name, partners in partners_of.items():
+        if name not in index:
+            continue
+        wanted = np.array([index[p] for p in partners if p in index], dtype=np.int64)
+        listed = ranking.partners[index[name]]
+        hits = np.isin(listed[listed != NO_PARTNER], wanted)
+        possible = min(len(partners), ranking.depth)
+        precision = np.cumsum(hits) / np.arange(1, hits.size + 1)
+        precisions[name] = float(precision[hits].sum() / possible) if possible else 0.0
+    return precisions
+
+
+def mean_average_precision(ranking: Ranking, truth: Collection[tuple[str, str]]) -> float:
+    """Return the mean of `average_precisions`, 0..1; NaN where no image has a true partner."""
+    precisions = average_precisions(ranking, truth)
+    return math.fsum(precisions.values()) / len(precisions) if precisions else math.nan
+
+
+def efficiency(ranking: Ranking) -> float:
+    """Return eq. 20, T_fe + T_nns: the seconds of describing and of searching together."""
+    return ranking.seconds_describe + ranking.seconds_search
+
+
+def _share(part: int, whole: int) -> float:
+    return part / whole if whole else math.nan
