@@ -1,0 +1,1 @@
+"""A rendered drone flight with known camera poses, and the whole pipeline run on it."""

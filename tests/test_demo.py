@@ -1,0 +1,82 @@
+"""The rendered flight, and the fixtures that the other tests stand on."""
+
+from __future__ import annotations
+
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+
+from colmap_netvlad.database import open_database
+from colmap_netvlad.demo.render import Flight, FlightOptions, render_flight, to_wgs84
+
+
+def test_flight_reconstructs_whole_and_within_one_percent(flight: Flight, project_copy, tmp_path):
+    project = project_copy(matched=True)
+    pycolmap.set_random_seed(0)
+    models = pycolmap.incremental_mapping(project.database, project.images, tmp_path)
+    assert len(models) == 1
+    model = models[0]
+    assert model.num_reg_images() == len(flight.names)
+    estimated = {i.name: i.projection_center() for i in model.images.values()}
+    centres = np.array([estimated[name] for name in flight.names])
+    aligned = pycolmap.estimate_sim3d(centres, flight.centres)
+    moved = np.array([aligned * c for c in centres])
+    error = np.linalg.norm(moved - flight.centres, axis=1)
+    assert error.max() < 0.01 * flight.extent
+
+
+def test_photos_carry_focal_length_and_true_position(flight: Flight, project_copy):
+    project = project_copy()
+    with open_database(project.database) as database:
+        priors = database.pose_priors()
+        ids = {image.name: image.image_id for image in database.images()}
+    for name, centre in zip(flight.names, flight.centres, strict=True):
+        latitude, longitude, altitude = to_wgs84(centre)
+        found = priors[ids[name]].position
+        assert found[:2] == pytest.approx((latitude, longitude), abs=1e-7)
+        assert found[2] == pytest.approx(altitude, abs=0.002)
+    camera = pycolmap.infer_camera_from_image(flight.images / flight.names[0])
+    assert camera.has_prior_focal_length
+    assert camera.focal_length == pytest.approx(flight.focal, rel=1e-4)
+
+
+def test_same_seed_gives_same_photos_and_another_gives_other_land(tmp_path: Path):
+    options = FlightOptions(rows=1, columns=1, width=160, height=120)
+    photos = []
+    for folder, seed in (("a", 0), ("b", 0), ("c", 1)):
+        made = render_flight(tmp_path / folder, FlightOptions(**{**vars(options), "seed": seed}))
+        photos.append((made.images / made.names[0]).read_bytes())
+    assert photos[0] == photos[1]
+    assert photos[0] != photos[2]
+
+
+@pytest.mark.parametrize("ground", ["village", "plantation", "bare"])
+def test_each_ground_renders_a_photo_with_contrast(ground, tmp_path: Path):
+    made = render_flight(
+        tmp_path, FlightOptions(rows=1, columns=1, width=200, height=150, ground=ground)
+    )
+    pixels = cv2.imread(str(made.images / made.names[0]))
+    assert pixels.shape == (150, 200, 3)
+    assert pixels.std() > 3
+
+
+def test_blocks_are_separate_flights(tmp_path: Path):
+    made = render_flight(tmp_path, FlightOptions(rows=1, columns=2, width=120, height=90, blocks=2))
+    assert made.blocks.tolist() == [0, 0, 1, 1]
+    assert len(set(made.names)) == 4
+    assert np.linalg.norm(made.centres[0] - made.centres[2]) > 500
+
+
+def test_legacy_database_has_the_schema_of_colmap_3_9(legacy_database: Path, flight: Flight):
+    with closing(sqlite3.connect(legacy_database)) as connection:
+        assert connection.execute("PRAGMA user_version").fetchone() == (3900,)
+        tables = {r[0] for r in connection.execute("SELECT name FROM sqlite_master")}
+    assert not tables & {"pose_priors", "rigs", "frames"}
+    with open_database(legacy_database) as database:
+        assert {image.name for image in database.images()} == set(flight.names)
+        assert min(database.keypoint_counts().values()) > 100
