@@ -1,0 +1,244 @@
+"""Training batches: which photos, and which of them is anchor, positive, negative (section 3.1).
+
+Batched nontrivial sampling (eq. 6 and 8) needs no descriptors: B scenes, one anchor each, M of
+its positives; the other anchors' positives are its negatives. Global hard negative mining (eq. 7)
+describes all photos before each epoch and takes the nearest photos of other scenes. Beside the
+paper's, each anchor can get negatives of its own flight that surely show other ground: another
+flight is trivially different, and telling apart photos of one flight is the task.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_netvlad.errors import InputError
+from colmap_netvlad.training.scenes import Scene
+
+MINING = ("nontrivial", "global")
+
+
+@dataclass(frozen=True)
+class Query:
+    """Roles in a batch, by row: the anchor, its positives by descending GS, its negatives."""
+
+    anchor: int
+    positives: tuple[int, ...]
+    negatives: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Batch:
+    """The photos of a batch as (scene index, image index), and the queries over them."""
+
+    samples: tuple[tuple[int, int], ...]
+    queries: tuple[Query, ...]
+
+
+@dataclass(frozen=True)
+class SamplingOptions:
+    """How batches are drawn.
+
+    Attributes:
+        mining: "nontrivial" (eq. 8) or "global" (eq. 7).
+        scenes: B, the anchors of a batch, each of another scene.
+        positives: M, the positives of an anchor.
+        epsilon: a positive shares more than this many 3D points with its anchor (eq. 6).
+        hard_negatives: negatives of an anchor in global mining, each of another scene.
+        same_flight: further negatives of an anchor from its own flight, surely apart.
+        pseudo_share: the share of anchors drawn from pseudo-scenes, 0..1.
+        seed: of all draws.
+    """
+
+    mining: str = "nontrivial"
+    scenes: int = 5
+    positives: int = 3
+    epsilon: int = 15
+    hard_negatives: int = 2
+    same_flight: int = 0
+    pseudo_share: float = 0.0
+    seed: int = 0
+
+
+class Sampler:
+    """Draws batches from annotated scenes; the same seed and epoch give the same batches.
+
+    Attributes:
+        scenes: the scenes, as given.
+        left_out: sentences on scenes that no batch can be drawn from.
+    """
+
+    def __init__(self, scenes: Sequence[Scene], options: SamplingOptions) -> None:
+        """Find the possible anchors of each scene.
+
+        Raises:
+            InputError: no scene has an anchor with enough positives, or there is one scene
+                only and no same-flight negatives were asked for.
+        """
+        self.scenes = list(scenes)
+        self.options = options
+        self.left_out: list[str] = []
+        self._positives = [_positives(scene, options.epsilon) for scene in scenes]
+        self._anchors: dict[int, list[int]] = {}
+        for index, scene in enumerate(scenes):
+            anchors = [
+                image
+                for image, found in enumerate(self._positives[index])
+                if len(found) >= options.positives
+            ]
+            if anchors:
+                self._anchors[index] = anchors
+            elif scene.crops is None:
+                self.left_out.append(
+                    f"Scene {scene.name} is left out: none of its {len(scene)} photos shares more "
+                    f"than {options.epsilon} points with {options.positives} others."
+                )
+        self._real = [index for index in self._anchors if scenes[index].crops is None]
+        self._pseudo = [index for index in self._anchors if scenes[index].crops is not None]
+        self._check()
+
+    def _check(self) -> None:
+        if not self._anchors:
+            raise InputError(
+                "No scene can give a batch: an anchor needs "
+                f"{self.options.positives} positives with more than {self.options.epsilon} common "
+                "points. " + " ".join(self.left_out)
+            )
+        if len(self._anchors) > 1:
+            return
+        (only,) = self._anchors
+        if self.options.mining == "global" or not self.options.same_flight:
+            raise InputError(
+                f"There is one usable scene only ({self.scenes[only].name}), and negatives come "
+                "from other scenes: annotate another flight, or ask for --same-flight negatives."
+            )
+        scene = self.scenes[only]
+        self._anchors[only] = [i for i in self._anchors[only] if len(scene.apart(i))]
+        if not self._anchors[only]:
+            raise InputError(
+                f"The one usable scene {scene.name} has no two photos that are surely apart, so "
+                "there are no negatives: annotate another flight."
+            )
+
+    def batches(
+        self, epoch: int, count: int, descriptors: Sequence[NDArray[np.floating]] | None = None
+    ) -> list[Batch]:
+        """Draw the `count` batches of an epoch.
+
+        Args:
+            descriptors: for global mining, one (N, D) L2-normalised array a scene, of the
+                network as it stands before the epoch.
+        """
+        rng = np.random.default_rng([self.options.seed, epoch])
+        if self.options.mining == "global":
+            if descriptors is None:
+                raise ValueError("global hard negative mining needs the descriptors")
+            return [self._hard_batch(rng, descriptors) for _ in range(count)]
+        return [self._nontrivial_batch(rng) for _ in range(count)]
+
+    def _nontrivial_batch(self, rng: np.random.Generator) -> Batch:
+        builder = _Builder()
+        drawn = []
+        for scene in self._draw_scenes(rng):
+            anchor, positives = self._draw_positives(rng, scene)
+            row = builder.add(scene, anchor)
+            rows = tuple(builder.add(scene, image) for image in positives)
+            own = tuple(builder.add(scene, image) for image in self._draw_apart(rng, scene, anchor))
+            drawn.append((row, rows, own))
+        queries = []
+        for number, (row, rows, own) in enumerate(drawn):
+            others = [p for k, (_, rows_k, _) in enumerate(drawn) if k != number for p in rows_k]
+            queries.append(Query(row, rows, (*others, *own)))
+        return Batch(tuple(builder.samples), tuple(queries))
+
+    def _hard_batch(
+        self, rng: np.random.Generator, descriptors: Sequence[NDArray[np.floating]]
+    ) -> Batch:
+        builder = _Builder()
+        queries = []
+        for scene in self._draw_scenes(rng):
+            anchor, positives = self._draw_positives(rng, scene)
+            hardest = nearest_of_other_scenes(descriptors, scene, anchor)
+            chosen = rng.permutation(len(hardest))[: self.options.hard_negatives]
+            row = builder.add(scene, anchor)
+            rows = tuple(builder.add(scene, image) for image in positives)
+            negatives = [builder.add(*hardest[number]) for number in chosen]
+            negatives += [builder.add(scene, i) for i in self._draw_apart(rng, scene, anchor)]
+            queries.append(Query(row, rows, tuple(negatives)))
+        return Batch(tuple(builder.samples), tuple(queries))
+
+    def _draw_scenes(self, rng: np.random.Generator) -> list[int]:
+        """B scenes without repetition (fewer where there are fewer)."""
+        options = self.options
+        pseudo = int((rng.random(options.scenes) < options.pseudo_share).sum())
+        if not self._real:
+            pseudo = options.scenes
+        pseudo = min(pseudo, len(self._pseudo))
+        real = min(options.scenes - pseudo, len(self._real))
+        chosen = [self._real[i] for i in rng.permutation(len(self._real))[:real]]
+        if pseudo:
+            picks = rng.choice(len(self._pseudo), size=pseudo, replace=False)
+            chosen += [self._pseudo[i] for i in picks]
+        return chosen
+
+    def _draw_positives(self, rng: np.random.Generator, scene: int) -> tuple[int, list[int]]:
+        """One anchor and M of its positives (eq. 6), by descending GS."""
+        anchor = int(rng.choice(self._anchors[scene]))
+        found = self._positives[scene][anchor]
+        picks = np.sort(rng.permutation(len(found))[: self.options.positives])
+        return anchor, [int(found[i]) for i in picks]
+
+    def _draw_apart(self, rng: np.random.Generator, scene: int, anchor: int) -> list[int]:
+        if not self.options.same_flight:
+            return []
+        apart = self.scenes[scene].apart(anchor)
+        return [int(apart[i]) for i in rng.permutation(len(apart))[: self.options.same_flight]]
+
+
+def nearest_of_other_scenes(
+    descriptors: Sequence[NDArray[np.floating]], scene: int, image: int
+) -> list[tuple[int, int]]:
+    """Return for each other scene k its photo nearest to the query: argmin ||f_q - f_n|| (eq. 7).
+
+    Args:
+        descriptors: one (N, D) L2-normalised array a scene.
+        scene, image: the query.
+    """
+    query = descriptors[scene][image].astype(np.float32)
+    return [
+        # Of unit vectors the nearest is the one with the largest inner product.
+        (k, int(np.argmax(others @ query)))
+        for k, others in enumerate(descriptors)
+        if k != scene and len(others)
+    ]
+
+
+def _positives(scene: Scene, epsilon: int) -> list[NDArray[np.intp]]:
+    """For each image its possible positives {t: GS(t, q) > epsilon}, by descending GS."""
+    table = scene.common_points
+    found = []
+    for image in range(len(scene)):
+        row = slice(table.indptr[image], table.indptr[image + 1])
+        partners, counts = table.indices[row], table.data[row]
+        keep = counts > epsilon
+        order = np.lexsort((partners[keep], -counts[keep]))
+        found.append(partners[keep][order].astype(np.intp))
+    return found
+
+
+class _Builder:
+    """Collects the photos of a batch, each once."""
+
+    def __init__(self) -> None:
+        self.samples: list[tuple[int, int]] = []
+        self._rows: dict[tuple[int, int], int] = {}
+
+    def add(self, scene: int, image: int) -> int:
+        """Return the row of a photo, adding it where it is new."""
+        row = self._rows.setdefault((scene, image), len(self.samples))
+        if row == len(self.samples):
+            self.samples.append((scene, image))
+        return row
