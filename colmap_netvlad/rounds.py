@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from colmap_netvlad.metrics import CORRECT_MATCHES
-from colmap_netvlad.retrieval.ranking import NO_PARTNER, Ranking
 
 IndexPair = tuple[int, int]
 
@@ -80,34 +79,11 @@ class Candidates:
         return np.round(1.0 / (1.0 + np.exp(-logit)), 9)
 
 
-def similarity_matrix(ranking: Ranking) -> sparse.csr_array:
-    """Return the symmetric (N, N) sparse similarity of a ranking's candidates, above zero.
-
-    A row's scores are standardised over its own list, so that an image whose neighbours all
-    look alike does not outbid the others, and shifted so that "not listed" is zero; the two
-    directions of a pair are averaged.
-    """
-    n = len(ranking.names)
-    listed = ranking.partners != NO_PARTNER
-    rows = np.repeat(np.arange(n), listed.sum(axis=1))
-    scores = ranking.scores[listed].astype(np.float64)
-    count = np.maximum(np.bincount(rows, minlength=n), 1)
-    mean = np.bincount(rows, scores, minlength=n) / count
-    centred = scores - mean[rows]
-    spread = np.sqrt(np.bincount(rows, centred**2, minlength=n) / count)
-    standard = centred / np.maximum(spread, 1e-12)[rows]
-    floor = np.zeros(n)
-    np.minimum.at(floor, rows, standard)
-    values = standard - floor[rows] + 1e-6
-    directed = sparse.csr_array((values, (rows, ranking.partners[listed])), shape=(n, n))
-    return ((directed + directed.T) / 2).tocsr()
-
-
 def find_candidates(similarity: sparse.csr_array, verified: Mapping[IndexPair, int]) -> Candidates:
     """Return the untested pairs worth a thought, with what speaks for and against each.
 
     Args:
-        similarity: from `similarity_matrix`.
+        similarity: from `retrieval.fusion.similarity_matrix`.
         verified: verified matches of every tested pair (0 where it failed).
     """
     n = similarity.shape[0]

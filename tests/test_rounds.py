@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 from scipy import sparse
 
 from colmap_netvlad.metrics import CORRECT_MATCHES
+from colmap_netvlad.retrieval.fusion import similarity_matrix
 from colmap_netvlad.retrieval.ranking import Ranking, from_lists
 from colmap_netvlad.rounds import (
     SATURATION,
     find_candidates,
     next_round,
-    similarity_matrix,
     split_budget,
     take_turns,
 )

@@ -1,0 +1,129 @@
+"""Rankings that add up: sparse similarities, fusion, query expansion.
+
+What deep features see and what SIFT sees differs, so their rankings are better together than
+either alone. Everything works on sparse (N, N) matrices of the candidates the rankings list: no
+dense matrix, so 20,000 images fit in memory.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from scipy import sparse
+
+from colmap_netvlad.errors import InputError
+from colmap_netvlad.retrieval.ranking import NO_PARTNER, Ranking
+
+BLOCK_ROWS = 1024
+"""Rows of a sparse product that are in memory at once."""
+
+
+def similarity_matrix(ranking: Ranking) -> sparse.csr_array:
+    """Return the symmetric (N, N) sparse similarity of a ranking's candidates, all above zero.
+
+    A row's scores are standardised over its own list, so that rankings of different units add
+    up and an image whose neighbours all look alike does not outbid the others; they are shifted
+    so that "not listed" is zero, and the two directions of a pair are averaged.
+    """
+    n = len(ranking.names)
+    listed = ranking.partners != NO_PARTNER
+    rows = np.repeat(np.arange(n), listed.sum(axis=1))
+    scores = ranking.scores[listed].astype(np.float64)
+    count = np.maximum(np.bincount(rows, minlength=n), 1)
+    mean = np.bincount(rows, scores, minlength=n) / count
+    centred = scores - mean[rows]
+    spread = np.sqrt(np.bincount(rows, centred**2, minlength=n) / count)
+    standard = centred / np.maximum(spread, 1e-12)[rows]
+    floor = np.zeros(n)
+    np.minimum.at(floor, rows, standard)
+    # A whisker above the floor keeps the least similar partner listed.
+    values = standard - floor[rows] + 1e-6
+    directed = sparse.csr_array((values, (rows, ranking.partners[listed])), shape=(n, n))
+    return ((directed + directed.T) / 2).tocsr()
+
+
+def fuse(rankings: Sequence[Ranking], weights: Sequence[float]) -> sparse.csr_array:
+    """Return the weighted sum of the rankings' similarities, (N, N) symmetric and sparse.
+
+    Raises:
+        InputError: the rankings are of different image sets.
+    """
+    names = rankings[0].names
+    for ranking in rankings[1:]:
+        if ranking.names != names:
+            raise InputError(
+                f"The rankings of {rankings[0].method} ({len(names)} images) and "
+                f"{ranking.method} ({len(ranking.names)} images) are of different image sets; "
+                "make both from the same database."
+            )
+    total = similarity_matrix(rankings[0]) * weights[0]
+    for ranking, weight in zip(rankings[1:], weights[1:], strict=True):
+        total = total + similarity_matrix(ranking) * weight
+    return total.tocsr()
+
+
+def expand(
+    similarity: sparse.csr_array, neighbours: int, share: float, depth: int
+) -> sparse.csr_array:
+    """Query expansion over the nearest-neighbour graph: what my neighbours like, I like.
+
+    Each row becomes (1 - share) times itself plus `share` times the similarity-weighted mean of
+    the rows of its `neighbours` best partners; the best `depth` of each row are kept.
+
+    Returns:
+        (N, N) symmetric sparse similarity.
+    """
+    voters = keep_best(similarity, neighbours)
+    total = np.maximum(voters.sum(axis=1), 1e-12)
+    voters = (sparse.diags_array(1.0 / total) @ voters).tocsr()
+    blocks = []
+    for rows in _blocks(similarity.shape[0]):
+        mixed = (1 - share) * similarity[rows] + share * (voters[rows] @ similarity)
+        blocks.append(keep_best(_without_self(mixed.tocsr(), rows.start), depth))
+    expanded = sparse.vstack(blocks).tocsr()
+    return ((expanded + expanded.T) / 2).tocsr()
+
+
+def keep_best(matrix: sparse.csr_array, depth: int) -> sparse.csr_array:
+    """Return the matrix with only the `depth` largest values of each row."""
+    matrix = matrix.tocsr()
+    rows = np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
+    order = np.lexsort((matrix.indices, -matrix.data, rows))
+    place = np.arange(len(rows)) - matrix.indptr[rows]
+    kept = order[place < depth]
+    return sparse.csr_array(
+        (matrix.data[kept], (rows[kept], matrix.indices[kept])), shape=matrix.shape
+    )
+
+
+def ranking_of(
+    similarity: sparse.csr_array, names: tuple[str, ...], method: str, depth: int
+) -> Ranking:
+    """Return each image's `depth` most similar partners as a ranking; equals go by name."""
+    n = len(names)
+    by_name = np.empty(n, dtype=np.int64)
+    by_name[np.argsort(np.array(names, dtype=object), kind="stable")] = np.arange(n)
+    rows = np.repeat(np.arange(n), np.diff(similarity.indptr))
+    order = np.lexsort((by_name[similarity.indices], -similarity.data.round(9), rows))
+    place = np.arange(len(rows)) - similarity.indptr[rows]
+    inside = place < depth
+    width = int(min(depth, np.diff(similarity.indptr).max(initial=0)))
+    partners = np.full((n, width), NO_PARTNER, dtype=np.int32)
+    scores = np.full((n, width), -np.inf, dtype=np.float32)
+    partners[rows[inside], place[inside]] = similarity.indices[order[inside]]
+    scores[rows[inside], place[inside]] = similarity.data[order[inside]]
+    return Ranking(names, partners, scores, method)
+
+
+def _without_self(block: sparse.csr_array, start: int) -> sparse.csr_array:
+    entries = block.tocoo()
+    other = entries.col != entries.row + start
+    return sparse.csr_array(
+        (entries.data[other], (entries.row[other], entries.col[other])), shape=block.shape
+    )
+
+
+def _blocks(n: int) -> Iterator[slice]:
+    for start in range(0, n, BLOCK_ROWS):
+        yield slice(start, min(start + BLOCK_ROWS, n))

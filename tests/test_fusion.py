@@ -1,0 +1,96 @@
+"""Rankings add up without a dense matrix."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import sparse
+
+from colmap_netvlad.errors import InputError
+from colmap_netvlad.retrieval.fusion import (
+    expand,
+    fuse,
+    keep_best,
+    ranking_of,
+    similarity_matrix,
+)
+from colmap_netvlad.retrieval.ranking import NO_PARTNER, Ranking, from_lists
+
+
+def full_ranking(scores: np.ndarray, method: str = "test", depth: int | None = None) -> Ranking:
+    n = len(scores)
+    lists = [
+        sorted(((j, float(scores[i, j])) for j in range(n) if j != i), key=lambda p: -p[1])
+        for i in range(n)
+    ]
+    return from_lists(tuple(f"{i}.jpg" for i in range(n)), [row[:depth] for row in lists], method)
+
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+@given(seeds, st.integers(2, 10))
+@settings(max_examples=40, deadline=None)
+def test_similarities_are_symmetric_and_do_not_change_with_the_unit(seed: int, n: int) -> None:
+    scores = np.random.default_rng(seed).normal(size=(n, n))
+    plain = similarity_matrix(full_ranking(scores)).toarray()
+    scaled = similarity_matrix(full_ranking(scores * 100 + 7)).toarray()
+    assert np.allclose(plain, plain.T)
+    assert (plain[~np.eye(n, dtype=bool)] > 0).all()
+    assert np.allclose(plain, scaled, atol=1e-3)
+
+
+@given(seeds, st.integers(3, 10), st.integers(1, 4), st.floats(0, 1))
+@settings(max_examples=40, deadline=None)
+def test_expansion_equals_its_definition_written_out(
+    seed: int, n: int, neighbours: int, share: float
+) -> None:
+    similarity = similarity_matrix(full_ranking(np.random.default_rng(seed).normal(size=(n, n))))
+    dense = similarity.toarray()
+    expected = np.zeros_like(dense)
+    for i in range(n):
+        best = np.argsort(-dense[i], kind="stable")[:neighbours]
+        weights = dense[i, best] / dense[i, best].sum()
+        expected[i] = (1 - share) * dense[i] + share * (weights @ dense[best])
+    np.fill_diagonal(expected, 0)
+    expected = (expected + expected.T) / 2
+    assert np.allclose(expand(similarity, neighbours, share, n).toarray(), expected)
+
+
+def test_two_weak_rankings_that_agree_beat_one_strong_voice() -> None:
+    a, b = np.zeros((4, 4)), np.zeros((4, 4))
+    a[0], b[0] = [0, 3, 2, 0], [0, 0, 2, 3]
+    a[0, 3] = b[0, 1] = -3
+    fused = fuse([full_ranking(a + a.T), full_ranking(b + b.T)], [1.0, 1.0])
+    assert ranking_of(fused, tuple("wxyz"), "hybrid", 3).partners[0, 0] == 2
+
+
+def test_rankings_of_different_images_are_refused_in_one_sentence() -> None:
+    one = full_ranking(np.eye(3))
+    other = full_ranking(np.eye(4), "vlad")
+    with pytest.raises(InputError, match="different image sets"):
+        fuse([one, other], [1.0, 1.0])
+
+
+@given(seeds, st.integers(1, 12), st.integers(1, 12))
+@settings(max_examples=40, deadline=None)
+def test_keep_best_keeps_the_largest_of_each_row(seed: int, n: int, depth: int) -> None:
+    dense = np.random.default_rng(seed).random((n, n)).round(2)
+    kept = keep_best(sparse.csr_array(dense), depth).toarray()
+    for full, row in zip(dense, kept, strict=True):
+        wanted = np.sort(full[full > 0])[::-1][:depth]
+        assert np.sort(row[row > 0])[::-1].tolist() == wanted.tolist()
+
+
+def test_a_ranking_lists_no_image_itself_and_pads_the_rest() -> None:
+    similarity = sparse.csr_array(np.array([[0, 2, 1], [2, 0, 0], [1, 0, 0]], float))
+    ranking = ranking_of(similarity, ("a", "b", "c"), "hybrid", 5)
+    assert ranking.partners.tolist() == [[1, 2], [0, NO_PARTNER], [0, NO_PARTNER]]
+    assert ranking.scores[1, 1] == -np.inf
+
+
+def test_equal_scores_are_ordered_by_name() -> None:
+    similarity = sparse.csr_array(np.array([[0, 1, 1], [1, 0, 1], [1, 1, 0]], float))
+    assert ranking_of(similarity, ("c", "b", "a"), "hybrid", 2).partners[0].tolist() == [2, 1]
