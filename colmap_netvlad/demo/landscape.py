@@ -19,6 +19,7 @@ Ground = Literal["village", "plantation", "bare"]
 that confuses retrieval. bare: sand with few marks, the weak texture that starves SIFT."""
 
 FloatImage = NDArray[np.float32]
+Mask = NDArray[np.bool_]
 
 SUN = np.array([-0.55, 0.45, 0.7]) / np.linalg.norm([-0.55, 0.45, 0.7])
 """Unit vector towards the sun (east, north, up)."""
@@ -68,6 +69,7 @@ class Landscape:
             round((extent.north - extent.south) / cell),
             round((extent.east - extent.west) / cell),
         )
+        self._side = self.cell * max(self.shape)
         rows, columns = np.mgrid[: self.shape[0], : self.shape[1]].astype(np.float32)
         self._east = np.float32(extent.west) + (columns + 0.5) * np.float32(cell)
         self._north = np.float32(extent.north) - (rows + 0.5) * np.float32(cell)
@@ -81,7 +83,7 @@ class Landscape:
         self._angle = self._rng.uniform(-0.6, 0.6)
         self._mottle = self._noise(2.0, 3)
         {"village": self._village, "plantation": self._plantation, "bare": self._bare}[ground]()
-        self._grain(0.02 if ground == "bare" else 0.10)
+        self._grain(0.015 if ground == "bare" else 0.07)
         self._light()
         self.eaves = np.array(self._eaves, np.float32)
         self.walls = np.array(self._walls, np.float32)
@@ -111,14 +113,14 @@ class Landscape:
         path = np.abs((across + 1.5 * np.sin(along / 40)) % 54.0 - 27) < 1.4
         self.colour[path] = (0.62, 0.53, 0.40)
         spacing, rows = 7.8, 7.8 * 0.866
-        half = 0.75 * max(self.extent.east - self.extent.west, self.extent.north)
+        half = 0.75 * self._side
         cosine, sine = np.cos(self._angle), np.sin(self._angle)
         for i, a in enumerate(np.arange(-half, half, rows)):
             for b in np.arange(-half, half, spacing) + spacing / 2 * (i % 2):
                 e = b * cosine - a * sine + self._rng.normal(0, 0.25)
                 n = b * sine + a * cosine + self._rng.normal(0, 0.25)
                 if self._rng.random() > 0.03:
-                    self._palm(e, n, self._rng.normal(3.9, 0.3), self._rng.normal(6.5, 0.6))
+                    self._palm(e, n, self._rng.normal(3.7, 0.3), self._rng.normal(4.6, 0.5))
 
     def _bare(self) -> None:
         sand = np.array(((0.78, 0.70, 0.56), (0.70, 0.68, 0.64), (0.66, 0.52, 0.40)), np.float32)
@@ -131,9 +133,7 @@ class Landscape:
 
     def _fields(self) -> None:
         """Parcels from halving a turned rectangle, each with its own crop, rows and wear."""
-        side = 1.5 * max(
-            self.extent.east - self.extent.west, self.extent.north - self.extent.south, 1.0
-        )
+        side = 1.5 * self._side
         parcels = self._split(-side / 2, -side / 2, side / 2, side / 2)
         label = np.zeros(self.shape, np.int32)
         for number, (a, b, c, d) in enumerate(parcels):
@@ -178,7 +178,7 @@ class Landscape:
 
     def _roads(self) -> list[NDArray[np.float64]]:
         """Draw two to four roads and return their middle lines, (P, 2) m."""
-        reach = 0.8 * max(self.extent.east - self.extent.west, self.extent.north)
+        reach = 0.8 * self._side
         steps = np.arange(-reach, reach, 2.0)
         roads = []
         for number in range(int(self._rng.integers(2, 5))):
@@ -195,14 +195,14 @@ class Landscape:
     def _road(self, line: NDArray[np.float64], width: float, paved: bool) -> None:
         points = self._pixels(line)
         verge = self._stroke(points, width + 2.2)
-        self.colour[verge] = self.colour[verge] * 0.5 + np.float32((0.26, 0.25, 0.17))
+        self.colour[verge] = self.colour[verge] * 0.5 + np.array((0.24, 0.24, 0.17), np.float32)
         lane = self._stroke(points, width)
         grey = (0.43, 0.43, 0.44) if paved else (0.66, 0.57, 0.44)
         wear = (1 + 0.16 * self._noise(5, 4) + 0.10 * self._noise(0.8, 2))[lane][:, None]
-        self.colour[lane] = np.float32(grey) * wear
+        self.colour[lane] = np.array(grey, np.float32) * wear
         if not paved:
             rut = self._stroke(points, width * 0.35)
-            self.colour[rut] = self.colour[rut] * np.float32((0.8, 0.87, 0.75))
+            self.colour[rut] = self.colour[rut] * np.array((0.8, 0.87, 0.75), np.float32)
             return
         paint = np.zeros(self.shape, np.uint8)
         for i in range(0, len(points) - 1, 3):
@@ -210,7 +210,8 @@ class Landscape:
         worn = (paint > 0) & (self._noise(2, 2) > -0.35)
         self.colour[worn] = (0.86, 0.86, 0.83)
         world = self._world(line)
-        for i in np.flatnonzero(self._rng.random(len(line) - 1) < 0.05):
+        for at in np.flatnonzero(self._rng.random(len(line) - 1) < 0.05):
+            i = int(at)
             heading = np.arctan2(*(world[i + 1] - world[i])[::-1])
             side = (width / 4) * self._rng.choice([-1, 1])
             e, n = world[i] + side * np.array([-np.sin(heading), np.cos(heading)])
@@ -218,9 +219,10 @@ class Landscape:
 
     def _houses(self, roads: list[NDArray[np.float64]]) -> None:
         """Houses with garden plots along the roads; none on a road or on one another."""
-        taken = np.zeros(self.shape, np.uint8)
+        near_road = np.zeros(self.shape, np.uint8)
         for road in roads:
-            cv2.polylines(taken, [self._grid_points(road)], False, 1, self._cells(8.5))
+            cv2.polylines(near_road, [self._grid_points(road)], False, 1, self._cells(8.5))
+        taken = near_road > 0
         for road in roads:
             position, step = self._rng.uniform(0, 10), 2.0
             while position / step < len(road) - 2:
@@ -231,45 +233,46 @@ class Landscape:
                         self._plot(road[i], heading, side, taken)
                 position += self._rng.uniform(15, 24)
 
-    def _plot(
-        self, at: NDArray[np.float64], heading: float, side: int, taken: NDArray[np.uint8]
-    ) -> None:
+    def _plot(self, at: NDArray[np.float64], heading: float, side: int, taken: Mask) -> None:
         half_a, half_b = self._rng.uniform(4.5, 8.0), self._rng.uniform(3.4, 5.2)
         away = side * (half_b + self._rng.uniform(6.0, 10.0))
         normal = np.array([-np.sin(heading), np.cos(heading)])
         e, n = at + away * normal
         turn = heading + self._rng.normal(0, 0.06)
-        footprint = self._rectangle(e, n, half_a, half_b, turn)
-        inside = np.zeros(self.shape, np.uint8)
-        cv2.fillConvexPoly(inside, footprint, 1)
-        if not inside.any() or taken[inside > 0].any():
+        patch = self._patch(e, n, 20.0)
+        if patch is None:
             return
-        garden_e, garden_n = np.array([e, n]) + side * 3.0 * normal
-        garden = np.zeros(self.shape, np.uint8)
-        cv2.fillConvexPoly(garden, self._rectangle(garden_e, garden_n, 9.5, 11.0, heading), 1)
-        free = (garden > 0) & (taken == 0)
-        lawn = np.float32(self._rng.uniform((0.30, 0.38, 0.16), (0.42, 0.50, 0.24)))
-        self.colour[free] = self.colour[free] * 0.35 + lawn * 0.65
-        hedge = cv2.morphologyEx(garden, cv2.MORPH_GRADIENT, self._disc(0.5)) > 0
-        hedge &= taken == 0
-        self.colour[hedge] = (0.17, 0.25, 0.11)
-        self.height[hedge] = self.ground[hedge] + 1.3
-        drive = self._rectangle(*(at + side * 5 * normal), 1.5, 5, heading)
-        cv2.fillConvexPoly(inside, drive, 2)
-        paved = (inside == 2) & (taken == 0)
-        self.colour[paved] = np.float32((0.6, 0.58, 0.55)) * self._rng.uniform(0.8, 1.1)
+
+        def within(where: NDArray[np.float64], a: float, b: float, turn: float) -> Mask:
+            along, across = self._local(patch, where[0], where[1], turn)
+            return (np.abs(along) <= a) & (np.abs(across) <= b)
+
+        house = np.array([e, n])
+        footprint = within(house, half_a, half_b, turn)
+        if not footprint.any() or taken[patch][footprint].any():
+            return
+        free = ~taken[patch]
+        middle = house + side * 3.0 * normal
+        garden = within(middle, 9.5, 11.0, heading)
+        lawn = self._rng.uniform((0.33, 0.38, 0.20), (0.44, 0.49, 0.27)).astype(np.float32)
+        colour, height = self.colour[patch], self.height[patch]
+        colour[garden & free] = colour[garden & free] * 0.35 + lawn * 0.65
+        hedge = garden & ~within(middle, 8.8, 10.3, heading) & free
+        colour[hedge] = (0.20, 0.26, 0.14)
+        height[hedge] = self.ground[patch][hedge] + 1.3
+        drive = within(at + side * 5 * normal, 1.5, 5.0, heading) & free
+        colour[drive] = np.array((0.6, 0.58, 0.55), np.float32) * self._rng.uniform(0.8, 1.1)
+        height[drive] = self.ground[patch][drive]
+        if self._rng.random() < 0.18:
+            pool = within(middle + 5 * side * normal, 2.4, 1.3, turn) & free
+            colour[pool] = (0.30, 0.62, 0.70)
         self._house(e, n, half_a, half_b, turn)
-        cv2.fillConvexPoly(taken, self._rectangle(e, n, half_a + 2, half_b + 2, turn), 1)
+        taken[patch] |= within(house, half_a + 2, half_b + 2, turn)
         for _ in range(int(self._rng.integers(0, 5))):
             a, b = self._rng.uniform(-9, 9), side * self._rng.uniform(6.5, 12)
             te = e + a * np.cos(heading) - b * np.sin(heading)
             tn = n + a * np.sin(heading) + b * np.cos(heading)
             self._tree(te, tn, self._rng.uniform(0.9, 2.2), self._rng.uniform(1.5, 4.5))
-        if self._rng.random() < 0.18:
-            pool = self._rectangle(garden_e + 5, garden_n, 2.4, 1.3, turn)
-            cv2.fillConvexPoly(inside, pool, 3)
-            wet = (inside == 3) & (self.house == 0)
-            self.colour[wet] = (0.30, 0.62, 0.70)
 
     def _house(self, e: float, n: float, half_a: float, half_b: float, turn: float) -> None:
         """A gable roof on four walls; `half_a` runs along the ridge."""
@@ -340,7 +343,7 @@ class Landscape:
         for e, n in self._scatter(0.020):
             row, column = self._cell_of(e, n)
             dense = grove[row, column] > 0.22
-            if (dense or self._rng.random() < 0.10) and self.house[row, column] == 0:
+            if (dense or self._rng.random() < 0.06) and self.house[row, column] == 0:
                 road = self.colour[row, column]
                 if road.max() - road.min() < 0.04:
                     continue
@@ -370,13 +373,12 @@ class Landscape:
         self, patch: tuple[slice, slice], distance: NDArray[np.floating], tall: float, tone: float
     ) -> None:
         """Raise a crown where `distance` (in radii) is below 1."""
-        leaves = self._rng.normal(0, 1, distance.shape).astype(np.float32)
-        leaves = cv2.GaussianBlur(leaves, (0, 0), max(0.22 / self.cell, 0.6))
+        leaves = self._soften(self._rng.standard_normal(distance.shape, np.float32), 0.22)
         leaves /= leaves.std() + 1e-6
         dome = np.sqrt(np.clip(1 - distance**2, 0, None))
-        top = self.ground[patch] + tall * (0.45 + 0.55 * dome) + 0.10 * tall * dome * leaves
+        top = self.ground[patch] + tall * (0.2 + 0.8 * dome) + 0.10 * tall * dome * leaves
         over = (distance < 1) & (top > self.height[patch])
-        green = np.float32((0.25, 0.34, 0.15)) * tone * self._rng.uniform(0.9, 1.1, 3)
+        green = np.array((0.29, 0.35, 0.19), np.float32) * tone * self._rng.uniform(0.9, 1.1, 3)
         shade = (0.62 + 0.42 * dome) * (1 + 0.20 * leaves)
         self.height[patch][over] = top[over]
         self.colour[patch][over] = (green * shade[..., None])[over]
@@ -384,13 +386,13 @@ class Landscape:
 
     def _grain(self, contrast: float) -> None:
         """The fine mottle of real ground that feature detectors live on."""
-        fine = self._noise(1.2, 3) + 0.6 * self._noise(4 * self.cell, 2)
-        tint = 1 + 0.05 * self._noise(7, 3)[..., None] * np.float32((1, 0.2, -1))
+        fine = self._noise(1.2, 3) + 0.5 * self._noise(3.2 * self.cell, 2)
+        tint = 1 + 0.05 * self._noise(7, 3)[..., None] * np.array((1, 0.2, -1), np.float32)
         self.colour *= tint * (1 + contrast * 1.6 * fine)[..., None]
 
     def _light(self) -> None:
         """Shade slopes by their angle to the sun, and darken what lies in a shadow."""
-        surface = cv2.GaussianBlur(self.height, (0, 0), max(0.12 / self.cell, 0.5))
+        surface = self._soften(self.height, 0.12)
         slope_e = cv2.Sobel(surface, cv2.CV_32F, 1, 0, ksize=3, scale=1 / (8 * self.cell))
         slope_n = -cv2.Sobel(surface, cv2.CV_32F, 0, 1, ksize=3, scale=1 / (8 * self.cell))
         facing = (SUN[2] - slope_e * SUN[0] - slope_n * SUN[1]) / np.sqrt(
@@ -403,15 +405,16 @@ class Landscape:
         for run in np.arange(stride, longest, stride):
             horizontal = float(np.hypot(SUN[0], SUN[1]))
             shift = run / horizontal / self.cell
-            move = np.float32([[1, 0, -shift * SUN[0]], [0, 1, shift * SUN[1]]])
+            move = np.array([[1, 0, -shift * SUN[0]], [0, 1, shift * SUN[1]]], np.float32)
             size = (self.shape[1], self.shape[0])
             blocker = cv2.warpAffine(self.height, move, size, borderMode=cv2.BORDER_REPLICATE)
             above = blocker - self.height - np.float32(run * SUN[2] / horizontal)
             np.maximum(shadow, np.clip(above * 2, 0, 1), out=shadow)
-        shadow = cv2.GaussianBlur(shadow, (0, 0), max(0.15 / self.cell, 0.5))
-        sun = (light * (1 - shadow))[..., None]
-        sky = np.float32((0.34, 0.37, 0.43))
-        self.colour = np.clip(self.colour * (sky + np.float32((0.74, 0.70, 0.62)) * sun), 0, 1)
+        sun = (light * (1 - self._soften(shadow, 0.15)))[..., None]
+        sky = np.array((0.42, 0.44, 0.48), np.float32)
+        self.colour = np.clip(
+            self.colour * (sky + np.array((0.70, 0.67, 0.61), np.float32) * sun), 0, 1
+        )
 
     # Small tools
 
@@ -426,6 +429,10 @@ class Landscape:
             smooth = cv2.resize(knots, rows[::-1], interpolation=cv2.INTER_CUBIC)
             total += 0.55**octave * smooth[: self.shape[0], : self.shape[1]]
         return total
+
+    def _soften(self, grid: FloatImage, metres: float) -> FloatImage:
+        sigma = max(metres / self.cell, 0.5)
+        return np.asarray(cv2.GaussianBlur(grid, (0, 0), sigma), np.float32)
 
     def _turned(self, angle: float) -> tuple[FloatImage, FloatImage]:
         cosine, sine = np.float32(np.cos(angle)), np.float32(np.sin(angle))
@@ -445,16 +452,7 @@ class Landscape:
         rows = (self.extent.north - world[:, 1]) / self.cell
         return np.stack([columns, rows], 1).round().astype(np.int32)
 
-    def _rectangle(
-        self, e: float, n: float, half_a: float, half_b: float, turn: float
-    ) -> NDArray[np.int32]:
-        corners = np.array(
-            [(-half_a, -half_b), (half_a, -half_b), (half_a, half_b), (-half_a, half_b)]
-        )
-        cosine, sine = np.cos(turn), np.sin(turn)
-        return self._grid_points(corners @ np.array([[cosine, sine], [-sine, cosine]]) + (e, n))
-
-    def _stroke(self, points: NDArray[np.int32], width: float) -> NDArray[np.bool_]:
+    def _stroke(self, points: NDArray[np.int32], width: float) -> Mask:
         mask = np.zeros(self.shape, np.uint8)
         cv2.polylines(mask, [points], False, 1, self._cells(width))
         return mask > 0

@@ -14,8 +14,11 @@ from numpy.typing import NDArray
 
 from colmap_netvlad.demo.exif import Exif, add_exif
 from colmap_netvlad.demo.landscape import Extent, Ground, Landscape
+from colmap_netvlad.errors import InputError
 from colmap_netvlad.files import write_atomically
 from colmap_netvlad.progress import step
+
+Heights = NDArray[np.float32] | np.float32
 
 FOCAL_35MM = 28
 """Focal length of the rendered camera on 35 mm film, mm."""
@@ -25,6 +28,9 @@ FILM_DIAGONAL = 43.266615305567875
 
 ORIGIN = (53.3811, -1.4701, 120.0)
 """Latitude and longitude (degrees) and altitude (m) of the flight's origin."""
+
+BLOCK_OFFSET = np.array([1000.0, 0.0, 0.0])
+"""From one block to the next on the map, m; each is rendered about its own origin."""
 
 TRUTH_FILE = "truth.json"
 
@@ -50,7 +56,7 @@ class FlightOptions:
     cross_rows: int = 0
     width: int = 640
     height: int = 480
-    altitude: float = 55.0
+    altitude: float = 80.0
     overlap: float = 0.7
     ground: Ground = "village"
     blocks: int = 1
@@ -97,54 +103,49 @@ def render_flight(folder: Path, options: FlightOptions = FlightOptions()) -> Fli
     """
     focal = FOCAL_35MM / FILM_DIAGONAL * math.hypot(options.width, options.height)
     images = folder / "images"
-    images.mkdir(parents=True, exist_ok=True)
-    names: list[str] = []
-    plans = []
-    count = options.blocks * (
-        options.rows * options.columns + options.cross_rows * _cross_columns(options)
-    )
-    with step("Rendering the flight", count) as bar:
-        for block in range(options.blocks):
-            seed = options.seed * 1000 + block
-            centres, rotations = _plan(options, focal, np.random.default_rng([seed, 1]))
-            reach = 0.5 * math.hypot(options.width, options.height) / focal * options.altitude * 1.3
-            extent = Extent(
-                *(centres[:, :2].min(axis=0) - reach).tolist(),
-                *(centres[:, :2].max(axis=0) + reach).tolist(),
+    try:
+        images.mkdir(parents=True, exist_ok=True)
+    except OSError as fault:
+        raise InputError(f"Cannot write {images}: {fault.strerror}.") from fault
+    plans = [_plan(options, focal, block) for block in range(options.blocks)]
+    size = len(plans[0][0])
+    names = tuple(f"DJI_{i + 1:04d}.JPG" for i in range(size * options.blocks))
+    with step("Rendering the flight", len(names)) as bar, ThreadPoolExecutor(2) as pool:
+        for block, (centres, rotations) in enumerate(plans):
+            landscape = Landscape(
+                _extent(centres, options, focal),
+                0.8 * options.altitude / focal,
+                options.ground,
+                _block_seed(options, block),
             )
-            cell = 0.8 * options.altitude / focal
-            landscape = Landscape(extent, cell, options.ground, seed)
-            block_names = [f"DJI_{len(names) + i + 1:04d}.JPG" for i in range(len(centres))]
-            # Blocks lie a kilometre apart on the map; each is rendered about its own origin.
-            offset = np.array([1000.0 * block, 0.0, 0.0])
 
             def photo(
                 i: int,
                 landscape: Landscape = landscape,
-                names: list[str] = block_names,
                 centres: NDArray[np.float64] = centres,
                 rotations: NDArray[np.float64] = rotations,
-                offset: NDArray[np.float64] = offset,
-                seed: int = seed,
+                block: int = block,
             ) -> None:
-                size = (options.width, options.height)
-                pixels = render_photo(landscape, centres[i], rotations[i], focal, size)
-                pixels = _develop(pixels, np.random.default_rng([seed, 2, i]))
-                exif = _exif(centres[i] + offset, i)
-                write_atomically(images / names[i], add_exif(_jpeg(pixels), exif))
+                seen = render_photo(
+                    landscape, centres[i], rotations[i], focal, (options.width, options.height)
+                )
+                rng = np.random.default_rng([_block_seed(options, block), 2, i])
+                exif = _exif(centres[i] + block * BLOCK_OFFSET, i)
+                write_atomically(
+                    images / names[block * size + i], add_exif(_jpeg(_develop(seen, rng)), exif)
+                )
                 bar.advance()
 
-            with ThreadPoolExecutor(2) as pool:
-                list(pool.map(photo, range(len(centres))))
-            names += block_names
-            plans.append((centres + offset, rotations, np.full(len(centres), block)))
+            list(pool.map(photo, range(size)))
     flight = Flight(
-        images,
-        tuple(names),
-        *(np.concatenate(parts) for parts in zip(*plans, strict=True)),
-        options.width,
-        options.height,
-        focal,
+        images=images,
+        names=names,
+        centres=np.concatenate([c + b * BLOCK_OFFSET for b, (c, _) in enumerate(plans)]),
+        rotations=np.concatenate([rotations for _, rotations in plans]),
+        blocks=np.repeat(np.arange(options.blocks), size),
+        width=options.width,
+        height=options.height,
+        focal=focal,
     )
     write_atomically(folder / TRUTH_FILE, json.dumps(_truth(flight), indent=1) + "\n")
     return flight
@@ -185,13 +186,13 @@ def render_photo(
     lean_e = (rays[..., 0] / rays[..., 2]).astype(np.float32)
     lean_n = (rays[..., 1] / rays[..., 2]).astype(np.float32)
 
-    def place(up: NDArray[np.float32] | np.float32) -> tuple[NDArray[np.float32], ...]:
+    def place(up: Heights) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         below = up - np.float32(centre[2])
         return landscape.grid(
             np.float32(centre[0]) + below * lean_e, np.float32(centre[1]) + below * lean_n
         )
 
-    def surface(up: NDArray[np.float32] | np.float32) -> NDArray[np.float32]:
+    def surface(up: Heights) -> NDArray[np.float32]:
         return _look_up(landscape.height, *place(up))
 
     top, bottom = float(landscape.height.max()), float(landscape.height.min())
@@ -206,7 +207,7 @@ def render_photo(
     above = np.float32(top) - depth * drop
     under = above - drop
     for _ in range(6):
-        middle = (above + under) / 2
+        middle = (above + under) * np.float32(0.5)
         hit = surface(middle) >= middle
         under = np.where(hit, middle, under)
         above = np.where(hit, above, middle)
@@ -223,7 +224,7 @@ def render_photo(
         pane = (np.abs(along[wall] % 2.6 - 1.3) < 0.5) & (
             np.abs((under - foot)[wall] % 2.9 - 1.6) < 0.65
         )
-        colour[wall] = np.where(pane[:, None], np.float32((0.2, 0.22, 0.26)), plaster)
+        colour[wall] = np.where(pane[:, None], np.array((0.2, 0.22, 0.26), np.float32), plaster)
         colour[wall] *= light[wall][:, None]
     return colour
 
@@ -237,17 +238,26 @@ def _look_up(
     return cv2.remap(grid, columns, rows, interpolation, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[return-value]
 
 
-def _cross_columns(options: FlightOptions) -> int:
-    return options.rows + 1
+def _block_seed(options: FlightOptions, block: int) -> int:
+    return options.seed * 1000 + block
+
+
+def _extent(centres: NDArray[np.float64], options: FlightOptions, focal: float) -> Extent:
+    """Return the ground that photos from `centres` can see, with a margin for tilt and relief."""
+    reach = 0.65 * math.hypot(options.width, options.height) / focal * options.altitude
+    west, south = (centres[:, :2].min(axis=0) - reach).tolist()
+    east, north = (centres[:, :2].max(axis=0) + reach).tolist()
+    return Extent(west, south, east, north)
 
 
 def _plan(
-    options: FlightOptions, focal: float, rng: np.random.Generator
+    options: FlightOptions, focal: float, block: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return camera centres and rotations of the flight lines, as a drone flies them.
 
     The drone turns at the end of each line, so that every second line is seen upside down.
     """
+    rng = np.random.default_rng([_block_seed(options, block), 1])
     across = (1 - options.overlap) * options.width / focal * options.altitude
     forward = (1 - options.overlap) * options.height / focal * options.altitude
     centres, rotations = [], []
@@ -265,7 +275,7 @@ def _plan(
             shoot(e, n, options.altitude, 0.0 if i % 2 == 0 else math.pi)
     if options.cross_rows:
         lines = np.linspace(north[0], north[-1], options.cross_rows + 2)[1:-1]
-        places = np.linspace(east[0] - across / 2, east[-1] + across / 2, _cross_columns(options))
+        places = np.linspace(east[0] - across / 2, east[-1] + across / 2, options.rows + 1)
         for i, n in enumerate(lines):
             for e in places[:: 1 if i % 2 == 0 else -1]:
                 heading = math.pi / 2 if i % 2 == 0 else -math.pi / 2
