@@ -24,7 +24,9 @@ class Ranking:
         method: the method's name in the table of methods.
         seconds_describe: T_fe of the paper's eq. 20: describing the images, s.
         seconds_search: T_nns of eq. 20: searching the neighbours, s.
-        notes: sentences for the report (which vocabulary tree, which photos were left out).
+        notes: sentences for the report (which vocabulary tree, what came from the cache).
+        left_out: (image name, reason) of images that could not be described; their rows are
+            empty.
     """
 
     names: tuple[str, ...]
@@ -34,6 +36,7 @@ class Ranking:
     seconds_describe: float = 0.0
     seconds_search: float = 0.0
     notes: tuple[str, ...] = field(default=())
+    left_out: tuple[tuple[str, str], ...] = field(default=())
 
     def __post_init__(self) -> None:
         shape = (len(self.names), self.partners.shape[1])

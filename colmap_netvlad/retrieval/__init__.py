@@ -1,0 +1,1 @@
+"""Retrieval: from a project to a ranking, one file a method."""

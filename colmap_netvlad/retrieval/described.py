@@ -1,0 +1,70 @@
+"""From descriptors in the store to a ranking: what every descriptor method ends with."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from colmap_netvlad.retrieval.ranking import NO_PARTNER, Ranking
+from colmap_netvlad.retrieval.search import nearest
+from colmap_netvlad.retrieval.store import Store
+
+if TYPE_CHECKING:
+    from colmap_netvlad.retrieval.methods import RetrievalOptions
+
+
+def missing(store: Store, model: str, photos: Mapping[str, str]) -> list[str]:
+    """Return the names in `photos` (name -> fingerprint) that the model has not described yet,
+    or described from another content."""
+    known = store.described(model)
+    return [name for name, photo in photos.items() if known.get(name) != photo]
+
+
+def rank_described(
+    store: Store,
+    model: str,
+    names: Sequence[str],
+    left_out: Mapping[str, str],
+    options: RetrievalOptions,
+    method: str,
+    notes: Sequence[str] = (),
+) -> Ranking:
+    """Search the neighbours of all described images and rank them.
+
+    Args:
+        store: holds the descriptors of every name that is not in `left_out`.
+        model: fingerprint of the model that described them.
+        names: all image names of the project.
+        left_out: name -> reason; these have no partners and are nobody's partner.
+        options: k, exact, seed.
+        method: name for the ranking.
+        notes: for the report.
+
+    Returns:
+        A ranking whose `seconds_describe` is what all its descriptors took when they were
+        computed, whether now or in an earlier run.
+    """
+    rows = np.array([i for i, name in enumerate(names) if name not in left_out], np.int32)
+    described = [names[i] for i in rows]
+    start = time.perf_counter()
+    found, found_scores = nearest(
+        store.vectors(model, described), options.k, options.exact, options.seed
+    )
+    seconds_search = time.perf_counter() - start
+    partners = np.full((len(names), found.shape[1]), NO_PARTNER, np.int32)
+    scores = np.full(partners.shape, -np.inf, np.float32)
+    partners[rows] = rows[found]
+    scores[rows] = found_scores
+    return Ranking(
+        tuple(names),
+        partners,
+        scores,
+        method,
+        seconds_describe=store.seconds(model, described),
+        seconds_search=seconds_search,
+        notes=tuple(notes),
+        left_out=tuple(left_out.items()),
+    )

@@ -1,0 +1,186 @@
+"""The nearest neighbours of every descriptor among all others, by inner product.
+
+Exact search multiplies blocks of descriptors with each other; HNSW (the paper's section 4.2)
+builds faiss' graph index. Both read the descriptors in blocks, so a store larger than memory
+serves as well as an array, and neither makes an N x N matrix.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_netvlad.progress import step
+
+EXACT_UP_TO = 20_000
+"""Exact search up to this number of images, HNSW above: where `benchmarks/search_scale.py`
+measures the two to be equally fast. Exact grows with the square of the number; HNSW does not,
+but its graph must be built on one thread to be the same every time."""
+
+BLOCK_BYTES = 64 << 20
+"""Memory of one block of descriptors as float32."""
+
+BLOCK_ROWS = 4096
+"""Most rows of a block, so that the product of two blocks stays as small."""
+
+HNSW_LINKS = 32
+HNSW_BUILD = 80
+"""faiss' M and efConstruction."""
+
+
+class Vectors(Protocol):
+    """(N, D) L2-normalised rows that can be sliced: an array, or a store that reads them."""
+
+    shape: tuple[int, int]
+
+    def __getitem__(self, rows: slice) -> NDArray[np.floating]: ...
+
+
+Neighbours = tuple[NDArray[np.int32], NDArray[np.float32]]
+
+
+def nearest(
+    vectors: Vectors | NDArray[np.floating], k: int, exact: bool | None = None, seed: int = 0
+) -> Neighbours:
+    """Return for each row its `k` nearest other rows, best first.
+
+    Every row gets exactly `k` partners, never itself, none twice; equal scores are ordered by
+    row number.
+
+    Args:
+        vectors: (N, D) L2-normalised descriptors, N > k.
+        k: partners of each row, clamped to N - 1.
+        exact: True for exact search, False for HNSW, None to choose by `EXACT_UP_TO`.
+        seed: of HNSW's random levels.
+
+    Returns:
+        partners (N, k) int32 and scores (N, k) float32, the inner products (cosines), -1..1.
+    """
+    count = vectors.shape[0]
+    k = min(k, count - 1)
+    if k < 1:
+        return np.zeros((count, 0), np.int32), np.zeros((count, 0), np.float32)
+    if exact is None:
+        exact = count <= EXACT_UP_TO
+    return _exact(vectors, k) if exact else _hnsw(vectors, k, seed)
+
+
+def _exact(vectors: Vectors | NDArray[np.floating], k: int) -> Neighbours:
+    count = vectors.shape[0]
+    partners = np.zeros((count, k), np.int32)
+    scores = np.full((count, k), -np.inf, np.float32)
+    blocks = _blocks(count, vectors.shape[1])
+    with step("Searching neighbours", len(blocks)) as bar:
+        for i, rows in enumerate(blocks):
+            left = _load(vectors, rows)
+            own = left @ left.T
+            np.fill_diagonal(own, -np.inf)
+            _merge(partners, scores, rows, own, rows)
+            for columns in blocks[i + 1 :]:
+                # One product serves both images of a pair.
+                product = left @ _load(vectors, columns).T
+                _merge(partners, scores, rows, product, columns)
+                _merge(partners, scores, columns, product.T, rows)
+            bar.advance()
+    return partners, scores
+
+
+def _merge(
+    partners: NDArray[np.int32],
+    scores: NDArray[np.float32],
+    rows: slice,
+    found: NDArray[np.float32],
+    columns: slice,
+) -> None:
+    """Merge the scores `found` between `rows` and `columns` into the best of `rows` so far."""
+    k = partners.shape[1]
+    if found.shape[1] > k:
+        keep = np.argpartition(-found, k - 1, axis=1)[:, :k]
+        found = np.take_along_axis(found, keep, axis=1)
+    else:
+        keep = np.broadcast_to(np.arange(found.shape[1]), found.shape)
+    all_partners = np.hstack([partners[rows], (keep + columns.start).astype(np.int32)])
+    all_scores = np.hstack([scores[rows], found])
+    order = np.lexsort((all_partners, -all_scores))[:, :k]
+    partners[rows] = np.take_along_axis(all_partners, order, axis=1)
+    scores[rows] = np.take_along_axis(all_scores, order, axis=1)
+
+
+def _hnsw(vectors: Vectors | NDArray[np.floating], k: int, seed: int) -> Neighbours:
+    import faiss
+
+    count, dim = vectors.shape
+    float16 = faiss.ScalarQuantizer.QT_fp16
+    index: Any = faiss.IndexHNSWSQ(dim, float16, HNSW_LINKS, faiss.METRIC_INNER_PRODUCT)  # type: ignore[arg-type]
+    index.is_trained = True  # float16 codes have nothing to learn
+    index.hnsw.rng = faiss.RandomGenerator(seed)  # type: ignore[attr-defined]
+    index.hnsw.efConstruction = HNSW_BUILD
+    # Two more than asked for: the row itself, and a spare.
+    index.hnsw.efSearch = max(2 * (k + 2), 64)
+    partners = np.zeros((count, k), np.int32)
+    scores = np.zeros((count, k), np.float32)
+    blocks = _blocks(count, dim)
+    with step("Indexing descriptors", count) as bar, _one_thread(faiss):
+        for rows in blocks:
+            block = _load(vectors, rows)
+            index.add(block)
+            bar.advance(len(block))
+    short: list[int] = []
+    with step("Searching neighbours", count) as bar:
+        for rows in blocks:
+            block = _load(vectors, rows)
+            found_scores, found = index.search(block, min(k + 2, count))
+            for i, (row, row_scores) in enumerate(zip(found, found_scores, strict=True)):
+                # The row itself is removed by its number: with duplicates it is not always first.
+                keep = np.flatnonzero((row >= 0) & (row != rows.start + i))[:k]
+                if len(keep) < k:
+                    short.append(rows.start + i)
+                    continue
+                partners[rows.start + i] = row[keep]
+                scores[rows.start + i] = row_scores[keep]
+            bar.advance(len(block))
+    for row_number in short:
+        _search_exactly(vectors, blocks, row_number, partners, scores)
+    return partners, scores
+
+
+def _search_exactly(
+    vectors: Vectors | NDArray[np.floating],
+    blocks: list[slice],
+    row: int,
+    partners: NDArray[np.int32],
+    scores: NDArray[np.float32],
+) -> None:
+    """Fill one row by exact search: a part of the graph that its walk did not reach."""
+    rows = slice(row, row + 1)
+    query = _load(vectors, rows)
+    scores[rows] = -np.inf
+    for columns in blocks:
+        found = query @ _load(vectors, columns).T
+        if columns.start <= row < columns.stop:
+            found[0, row - columns.start] = -np.inf
+        _merge(partners, scores, rows, found, columns)
+
+
+def _blocks(count: int, dim: int) -> list[slice]:
+    size = min(max(BLOCK_BYTES // (4 * max(dim, 1)), 16), BLOCK_ROWS)
+    return [slice(start, min(start + size, count)) for start in range(0, count, size)]
+
+
+def _load(vectors: Vectors | NDArray[np.floating], rows: slice) -> NDArray[np.float32]:
+    return np.ascontiguousarray(vectors[rows], dtype=np.float32)
+
+
+@contextmanager
+def _one_thread(faiss: Any) -> Iterator[None]:
+    """faiss adds to HNSW in an order that depends on its threads; one thread is repeatable."""
+    threads = faiss.omp_get_max_threads()
+    faiss.omp_set_num_threads(1)
+    try:
+        yield
+    finally:
+        faiss.omp_set_num_threads(threads)
