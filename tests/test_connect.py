@@ -1,0 +1,41 @@
+"""Components get a small extra budget, and nobody uses it up alone."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import sparse
+
+from colmap_netvlad.connect import TRIES_PER_LINK, components, connecting_pairs
+
+
+def test_components_are_numbered_by_size() -> None:
+    assert components(6, [(4, 5), (0, 3), (3, 1)]).tolist() == [0, 0, 2, 0, 1, 1]
+    assert components(2, []).tolist() == [0, 1]
+
+
+def test_the_best_untested_pairs_across_components_come_first() -> None:
+    similarity = np.zeros((4, 4))
+    similarity[0, 2], similarity[1, 2], similarity[1, 3], similarity[0, 1] = 3, 2, 1, 9
+    matrix = sparse.csr_array(similarity + similarity.T)
+    component = components(4, [(0, 1), (2, 3)])
+    names = list("abcd")
+    assert connecting_pairs(matrix, component, [(0, 2)], names, 5) == [(1, 2), (1, 3)]
+    assert connecting_pairs(matrix, component, [(0, 2)], names, 1) == [(1, 2)]
+    assert connecting_pairs(matrix, components(4, [(0, 1), (1, 2), (2, 3)]), [], names, 5) == []
+
+
+def test_one_hopeless_link_does_not_starve_another() -> None:
+    n = 21
+    similarity = np.zeros((n, n))
+    similarity[:10, 10:20] = 5.0
+    similarity[0, 20] = 0.1
+    pairs = [(i, i + 1) for i in range(9)] + [(i, i + 1) for i in range(10, 19)]
+    chosen = connecting_pairs(
+        sparse.csr_array(similarity + similarity.T),
+        components(n, pairs),
+        [],
+        [f"{i:02d}" for i in range(n)],
+        10,
+    )
+    assert len(chosen) == TRIES_PER_LINK + 1
+    assert (0, 20) in chosen
