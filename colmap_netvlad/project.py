@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from colmap_netvlad.errors import InputError
@@ -19,10 +19,13 @@ class Project:
         database: the COLMAP database; it exists.
         images: the folder that image names are relative to, or None where it is not known
             (methods that need only features still run).
+        cache_file: our own file, where it is not to lie beside the database (a read-only
+            folder).
     """
 
     database: Path
     images: Path | None
+    cache_file: Path | None = None
 
     @property
     def folder(self) -> Path:
@@ -32,7 +35,7 @@ class Project:
     @property
     def cache(self) -> Path:
         """Our own sqlite file: descriptors, rankings, settings (`project.netvlad.db`)."""
-        return self.database.with_suffix(".netvlad.db")
+        return self.cache_file or self.database.with_suffix(".netvlad.db")
 
     @property
     def pairs(self) -> Path:
@@ -103,3 +106,24 @@ def open_project(
         if folder is not None and folder.is_dir():
             return Project(database, folder)
     return Project(database, None)
+
+
+def find_project(
+    database: Path | None, images: Path | None = None, cache: Path | None = None
+) -> Project:
+    """Locate a project as the commands do: as `open_project`, with the photo folder that the
+    cache remembers.
+
+    Args:
+        database: the COLMAP database, or None to look in the current folder.
+        images: the photo folder, or None for the one used last, else `images/`.
+        cache: our own file, or None for the one beside the database.
+
+    Raises:
+        InputError: no database, no such photo folder, or a damaged cache.
+    """
+    from colmap_netvlad.retrieval.store import remembered_images
+
+    database = locate_database(database)
+    remembered = remembered_images(Project(database, None, cache).cache)
+    return replace(open_project(database, images, remembered), cache_file=cache)

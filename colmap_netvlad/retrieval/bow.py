@@ -11,7 +11,7 @@ import hashlib
 import tempfile
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -125,7 +125,11 @@ def _own_tree(project: Project, seed: int) -> tuple[Path, str]:
 
 
 def _build(tree: Path, sample: NDArray[np.float32], words: int, seed: int) -> None:
-    pycolmap = _pycolmap()
+    import pycolmap
+
+    from colmap_netvlad.engine import silence
+
+    silence()
     pycolmap.set_random_seed(seed)
     index = pycolmap.VisualIndex.create(sample.shape[1], EMBEDDING)
     options = pycolmap.VisualIndex.BuildOptions()
@@ -146,7 +150,11 @@ def _query(
     features: Path, tree: Path, rows: dict[int, int], described: dict[int, int], depth: int
 ) -> tuple[NDArray[np.int32], float, float]:
     """Index all images and query each; return partners (N, depth) and the seconds of both."""
-    pycolmap = _pycolmap()
+    import pycolmap
+
+    from colmap_netvlad.engine import silence
+
+    silence()
     partners = np.full((len(rows), depth), NO_PARTNER, np.int32)
     database = pycolmap.Database.open(features)
     try:
@@ -181,7 +189,11 @@ def _keep(
 
 
 def _check_tree(tree: Path) -> None:
-    pycolmap = _pycolmap()
+    import pycolmap
+
+    from colmap_netvlad.engine import silence
+
+    silence()
     if not tree.is_file():
         raise InputError(f"The vocabulary tree {tree} does not exist.")
     try:
@@ -191,11 +203,3 @@ def _check_tree(tree: Path) -> None:
             f"{tree} is not a vocabulary tree that COLMAP 4 reads (FLANN trees of COLMAP 3.11 and "
             f"older are not): {str(fault).splitlines()[0]}"
         ) from fault
-
-
-def _pycolmap() -> Any:
-    """Import pycolmap with its log silenced unless asked for."""
-    import pycolmap
-
-    pycolmap.logging.minloglevel = 0 if progress.verbose else 2
-    return pycolmap

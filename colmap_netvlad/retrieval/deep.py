@@ -15,7 +15,7 @@ from colmap_netvlad.images import BadPhoto, load_batches, photo_fingerprint
 from colmap_netvlad.models.catalogue import CATALOGUE
 from colmap_netvlad.progress import step
 from colmap_netvlad.project import Project
-from colmap_netvlad.retrieval.described import missing, rank_described
+from colmap_netvlad.retrieval.described import cache_note, missing, rank_described
 from colmap_netvlad.retrieval.ranking import Ranking
 from colmap_netvlad.retrieval.store import Store
 
@@ -52,7 +52,7 @@ def rank(project: Project, name_or_path: str | Path, options: RetrievalOptions) 
                 f"None of the {len(names)} photos in {folder} can be used (first: {names[0]} "
                 f"{left_out[names[0]]}); mend --images."
             )
-        note = f"{len(to_do) - len(bad)} of {len(names) - len(left_out)} descriptors computed"
+        note = cache_note(len(to_do) - len(bad), len(names) - len(left_out))
         method = str(name_or_path) if str(name_or_path) in CATALOGUE else checkpoint.stem
         return rank_described(store, model, names, left_out, options, method, [note])
 

@@ -23,6 +23,16 @@ def missing(store: Store, model: str, photos: Mapping[str, str]) -> list[str]:
     return [name for name, photo in photos.items() if known.get(name) != photo]
 
 
+def cache_note(computed: int, total: int) -> str:
+    """Return the report's sentence on what was computed and what the cache had."""
+    if computed == total:
+        return f"{computed} of {total} descriptors computed"
+    return (
+        f"{computed} of {total} descriptors computed; the seconds of the others are those of the "
+        "run that computed them"
+    )
+
+
 def rank_described(
     store: Store,
     model: str,

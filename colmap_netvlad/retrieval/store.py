@@ -35,6 +35,7 @@ BUSY_SECONDS = 60.0
 """How long one process waits for another's transaction."""
 
 IMAGES_SETTING = "images"
+"""The photo folder: absolute, or relative to the cache where it lies below it."""
 
 
 class Store:
@@ -317,7 +318,7 @@ def remembered_images(cache: Path) -> Path | None:
         return None
     with Store(cache) as store:
         folder = store.setting(IMAGES_SETTING)
-    return None if folder is None else Path(folder)
+    return None if folder is None else cache.parent / folder
 
 
 def _sentence(path: Path, fault: str) -> str:

@@ -18,7 +18,7 @@ from colmap_netvlad.database import Database, open_database
 from colmap_netvlad.errors import InputError
 from colmap_netvlad.progress import step
 from colmap_netvlad.project import Project
-from colmap_netvlad.retrieval.described import missing, rank_described
+from colmap_netvlad.retrieval.described import cache_note, missing, rank_described
 from colmap_netvlad.retrieval.ranking import Ranking
 from colmap_netvlad.retrieval.store import Store
 
@@ -67,7 +67,7 @@ def rank(project: Project, options: RetrievalOptions) -> Ranking:
         to_do = missing(store, model, features)
         _describe(store, database, model, words, ids, features, to_do)
         left_out = {name: NO_FEATURES for name in names if name not in ids}
-        notes = [f"{len(to_do)} of {len(ids)} descriptors computed"]
+        notes = [cache_note(len(to_do), len(ids))]
         if learned:
             notes.append(f"codebook of {len(words)} words learned in {seconds_codebook:.1f} s")
         return rank_described(store, model, names, left_out, options, "vlad", notes)

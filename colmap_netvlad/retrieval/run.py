@@ -1,0 +1,162 @@
+"""What `colmap-netvlad pairs` does: rank, take the union of the top k, write the pairs list."""
+
+from __future__ import annotations
+
+import os
+import shlex
+from dataclasses import dataclass
+from pathlib import Path
+
+from colmap_netvlad.connect import components
+from colmap_netvlad.database import image_names
+from colmap_netvlad.errors import InputError
+from colmap_netvlad.models.catalogue import DEFAULT
+from colmap_netvlad.pairs import FORMATS, ImagePair, check_k, union_of_top, write_pairs
+from colmap_netvlad.project import Project
+from colmap_netvlad.retrieval.methods import RetrievalOptions, rank
+from colmap_netvlad.retrieval.ranking import Ranking
+from colmap_netvlad.retrieval.store import IMAGES_SETTING, Store
+
+SUFFIXES = {"colmap": ".txt", "csv": ".csv", "json": ".json"}
+
+
+@dataclass(frozen=True)
+class PairsReport:
+    """The result of `make_pairs`.
+
+    Attributes:
+        ranking: what the pairs were taken from, k deep.
+        pairs: the union of every image's own k partners.
+        components: image names of each connected component of the pairs, largest first.
+        output: the pairs list that holds every pair.
+        colmap_list: the list for COLMAP, where it cannot hold all pairs and so differs from
+            `output`; else None.
+        unwritable: image names that COLMAP's list cannot express.
+    """
+
+    ranking: Ranking
+    pairs: list[ImagePair]
+    components: list[list[str]]
+    output: Path
+    colmap_list: Path | None
+    unwritable: list[str]
+
+
+def make_pairs(
+    project: Project,
+    method: str = DEFAULT,
+    options: RetrievalOptions | None = None,
+    format: str = "colmap",
+    output: Path | None = None,
+) -> PairsReport:
+    """Retrieve each image's k nearest partners and write the union as a pairs list.
+
+    Never writes to the user's database. Descriptors, ranks and scores are kept in the project's
+    cache, where the photo folder is remembered as well.
+
+    Args:
+        project: database, photos, cache.
+        method: a name in `methods.METHODS`, or a checkpoint file.
+        options: k and what else a method takes.
+        format: "colmap", "csv" or "json".
+        output: the pairs list; default `pairs.txt` (.csv, .json) beside the database. Names that
+            COLMAP's list cannot express (spaces, a leading #) make a second, complete list:
+            the same name ending in .csv.
+
+    Raises:
+        InputError: anything in the input a user can mend.
+    """
+    options = options or RetrievalOptions()
+    if format not in FORMATS:
+        raise InputError(f"There is no format {format!r}; formats are {', '.join(FORMATS)}.")
+    output = output or project.pairs.with_suffix(SUFFIXES[format])
+    _protect(output, project)
+    k = check_k(options.k, len(image_names(project.database)))
+    ranking = rank(project, method, options)
+    if ranking.method != "exhaustive":
+        ranking = ranking.top(k)
+    pairs = union_of_top(ranking, ranking.depth)
+    _remember(project, ranking)
+    unwritable = write_pairs(output, pairs, format)
+    colmap_list = None
+    if unwritable:
+        colmap_list, output = output, output.with_suffix(".csv")
+        write_pairs(output, pairs, "csv")
+    return PairsReport(ranking, pairs, _components(ranking, pairs), output, colmap_list, unwritable)
+
+
+MOST_LISTED = 10
+"""Images listed by name for each component apart."""
+
+
+def summary(project: Project, report: PairsReport) -> list[str]:
+    """Return the lines that `colmap-netvlad pairs` prints."""
+    ranking = report.ranking
+    lines = [
+        f"Images       {len(ranking.names)}",
+        f"Pairs        {len(report.pairs)}  ({ranking.method}, union of each image's "
+        f"{ranking.depth} nearest)",
+        f"Description  {ranking.seconds_describe:.1f} s",
+        f"Search       {ranking.seconds_search:.1f} s",
+        *(f"Note         {note}" for note in ranking.notes),
+        *_component_lines(report.components),
+        f"Written      {report.output}",
+    ]
+    if report.colmap_list is not None:
+        lines.append(
+            f"Warning      {report.colmap_list} lacks the pairs of {len(report.unwritable)} "
+            f"images: COLMAP's list cannot hold names such as {report.unwritable[0]!r}; "
+            f"{report.output.name} has all pairs, and the next command reads it."
+        )
+    return [*lines, f"Next         {_next_command(project, report)}"]
+
+
+def _component_lines(groups: list[list[str]]) -> list[str]:
+    if len(groups) == 1:
+        return ["Components   1: the pairs connect all images"]
+    lines = [
+        f"Components   {len(groups)}: the pairs do not connect all images; a larger --k may. "
+        f"The largest has {len(groups[0])} images; apart from it are:"
+    ]
+    for group in groups[1:]:
+        more = f", and {len(group) - MOST_LISTED} more" if len(group) > MOST_LISTED else ""
+        lines.append(f"             {len(group)}: {', '.join(group[:MOST_LISTED])}{more}")
+    return lines
+
+
+def _next_command(project: Project, report: PairsReport) -> str:
+    words = ["colmap-netvlad", "reconstruct", "--db", str(project.database)]
+    if report.output != project.pairs:
+        words += ["--pairs", str(report.output)]
+    return shlex.join(words)
+
+
+def _protect(output: Path, project: Project) -> None:
+    for precious in (project.database, project.cache):
+        if output.resolve() == precious.resolve():
+            raise InputError(f"--output would overwrite {precious}; name another file.")
+
+
+def _remember(project: Project, ranking: Ranking) -> None:
+    """Keep the ranking and the photo folder, which as part of the workspace moves with it."""
+    with Store(project.cache) as store:
+        if project.images is not None:
+            store.remember(IMAGES_SETTING, _portable(project.images, project.cache.parent))
+        if ranking.method != "exhaustive":  # all pairs in order say nothing worth keeping
+            store.save_ranking(ranking)
+
+
+def _portable(folder: Path, base: Path) -> str:
+    folder, base = folder.resolve(), base.resolve()
+    return os.path.relpath(folder, base) if folder.is_relative_to(base) else str(folder)
+
+
+def _components(ranking: Ranking, pairs: list[ImagePair]) -> list[list[str]]:
+    index = {name: i for i, name in enumerate(ranking.names)}
+    labels = components(
+        len(ranking.names), ((index[pair.name1], index[pair.name2]) for pair in pairs)
+    )
+    groups: list[list[str]] = [[] for _ in range(int(labels.max()) + 1)]
+    for name, label in zip(ranking.names, labels.tolist(), strict=True):
+        groups[label].append(name)
+    return groups
