@@ -95,6 +95,13 @@ class Database:
             self._connection.execute("SELECT image_id, rows FROM descriptors WHERE rows > 0")
         )
 
+    def images_with_features(self) -> set[int]:
+        """Return the ids of images whose features COLMAP would not extract again (even if 0)."""
+        rows = self._connection.execute(
+            "SELECT image_id FROM keypoints INTERSECT SELECT image_id FROM descriptors"
+        )
+        return {image_id for (image_id,) in rows}
+
     def keypoints(self, image_id: int) -> NDArray[np.float32]:
         """Return (N, 2) keypoint positions x, y in pixels (COLMAP's: centre of pixel 0 is 0.5)."""
         row = self._connection.execute(

@@ -1,0 +1,24 @@
+"""Matches -> sparse models: the table of mappers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Protocol
+
+import pycolmap
+
+from colmap_netvlad.mapping.incremental import map_incremental
+from colmap_netvlad.mapping.options import MappingOptions
+
+
+class Mapper(Protocol):
+    """A mapper writes its models to `output`/0, 1, ... and returns them."""
+
+    def __call__(
+        self, database: Path, images: Path | None, output: Path, options: MappingOptions = ...
+    ) -> list[pycolmap.Reconstruction]:
+        """Reconstruct the images of `database`."""
+
+
+MAPPERS: dict[str, Mapper] = {"incremental": map_incremental}
+"""Name of `reconstruct --mapper` -> the mapper."""

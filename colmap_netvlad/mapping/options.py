@@ -1,0 +1,24 @@
+"""What every mapper is told."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class MappingOptions:
+    """Options that all mappers share; the rest is COLMAP's default.
+
+    Attributes:
+        seed: seed of every random choice.
+        min_model_size: smaller models are dropped, images (COLMAP's `min_model_size`).
+        max_models: most models that are tried (COLMAP's `max_num_models`).
+        threads: threads; None: all processors. Above 50,000 residuals COLMAP's bundle adjustment
+            adds in the order its threads finish, so only one thread gives the same last digits
+            twice.
+    """
+
+    seed: int = 0
+    min_model_size: int = 10
+    max_models: int = 50
+    threads: int | None = None

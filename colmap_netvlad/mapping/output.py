@@ -1,0 +1,49 @@
+"""Model folders that appear whole or not at all, and never over a user's models."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from colmap_netvlad.errors import InputError
+
+
+@contextmanager
+def model_folder(output: Path) -> Iterator[Path]:
+    """Yield a temporary folder beside `output` that becomes `output` when the block succeeds.
+
+    Raises:
+        InputError: `output` holds something already, or cannot be written.
+    """
+    if output.exists() and (not output.is_dir() or any(output.iterdir())):
+        raise InputError(f"{output} exists already and is left as it is; name another --output.")
+    try:
+        output.parent.mkdir(parents=True, exist_ok=True)
+        temporary = Path(tempfile.mkdtemp(prefix=f".{output.name}.", dir=output.parent))
+    except OSError as fault:
+        raise InputError(f"Cannot write {output}: {fault.strerror or fault}.") from fault
+    try:
+        yield temporary
+        temporary.chmod(0o755)
+        if output.exists():
+            output.rmdir()
+        temporary.rename(output)
+    except OSError as fault:
+        raise InputError(f"Cannot write {output}: {fault.strerror or fault}.") from fault
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def free_output(output: Path) -> Path:
+    """Return `output`, or `<output>-2`, `-3`, ... where it holds something already.
+
+    A user's models are never replaced: the newest model is the folder with the highest number.
+    """
+    candidate, number = output, 1
+    while candidate.exists() and (not candidate.is_dir() or any(candidate.iterdir())):
+        number += 1
+        candidate = output.with_name(f"{output.name}-{number}")
+    return candidate

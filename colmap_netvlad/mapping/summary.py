@@ -1,0 +1,63 @@
+"""The figures of a model that users compare."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import pycolmap
+
+
+@dataclass(frozen=True)
+class ModelSummary:
+    """Figures of one sparse model, or of several together.
+
+    Attributes:
+        registered: images with a pose.
+        points: 3D points.
+        mean_reprojection_error: COLMAP's figure, the mean over 3D points of a point's mean
+            error over its track, px; nan without points.
+        mean_track_length: observations of a point; nan without points.
+        observations: image points that see a 3D point.
+    """
+
+    registered: int
+    points: int
+    mean_reprojection_error: float
+    mean_track_length: float
+    observations: int
+
+
+def summarize(model: pycolmap.Reconstruction) -> ModelSummary:
+    """Return the figures of one model."""
+    points = model.num_points3D()
+    if not points:
+        return ModelSummary(model.num_reg_images(), 0, float("nan"), float("nan"), 0)
+    model.update_point_3d_errors()
+    return ModelSummary(
+        registered=model.num_reg_images(),
+        points=points,
+        mean_reprojection_error=model.compute_mean_reprojection_error(),
+        mean_track_length=model.compute_mean_track_length(),
+        observations=model.compute_num_observations(),
+    )
+
+
+def registered_names(models: Sequence[pycolmap.Reconstruction]) -> set[str]:
+    """Return the names of the images that have a pose in any of the models."""
+    return {model.image(image_id).name for model in models for image_id in model.reg_image_ids()}
+
+
+def combine(models: Sequence[pycolmap.Reconstruction]) -> ModelSummary:
+    """Return the figures of several models together; an image in two of them counts once."""
+    parts = [summary for summary in map(summarize, models) if summary.points]
+    points = sum(part.points for part in parts)
+    observations = sum(part.observations for part in parts)
+    error = sum(part.mean_reprojection_error * part.points for part in parts)
+    return ModelSummary(
+        registered=len(registered_names(models)),
+        points=points,
+        mean_reprojection_error=error / points if points else float("nan"),
+        mean_track_length=observations / points if points else float("nan"),
+        observations=observations,
+    )
