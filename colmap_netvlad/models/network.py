@@ -1,0 +1,44 @@
+"""A trunk, an aggregation and, where wanted, a whitening: pixels to one global descriptor."""
+
+from __future__ import annotations
+
+from torch import Tensor, nn
+from torch.nn import functional
+
+from colmap_netvlad.models.aggregation import Aggregation
+from colmap_netvlad.models.trunk import Trunk
+from colmap_netvlad.models.whitening import Whitening
+
+
+class GlobalDescriptor(nn.Module):
+    """The network that is trained and run.
+
+    Attributes:
+        trunk: pixels to local features.
+        aggregation: local features to one vector.
+        whitening: that vector to a shorter one, or None.
+        dim: D, length of the descriptor.
+    """
+
+    def __init__(
+        self, trunk: Trunk, aggregation: Aggregation, whitening: Whitening | None = None
+    ) -> None:
+        super().__init__()
+        self.trunk = trunk
+        self.aggregation = aggregation
+        self.whitening = whitening
+        self.dim = aggregation.dim if whitening is None else whitening.dim
+
+    def features(self, pixels: Tensor) -> Tensor:
+        """RGB pixels of 0..255, float (B, 3, H, W), to the trunk's features (B, C, h, w)."""
+        height, width = pixels.shape[-2:]
+        if min(height, width) < self.trunk.stride:
+            # Too small for a single feature: enlarged, so that any photo has a descriptor.
+            size = (max(height, self.trunk.stride), max(width, self.trunk.stride))
+            pixels = functional.interpolate(pixels, size)
+        return self.trunk(self.trunk.normalisation(pixels))
+
+    def forward(self, pixels: Tensor) -> Tensor:
+        """RGB pixels of 0..255, float (B, 3, H, W), to descriptors (B, D), L2-normalised."""
+        descriptors = self.aggregation(self.features(pixels))
+        return descriptors if self.whitening is None else self.whitening(descriptors)
