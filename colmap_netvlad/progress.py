@@ -65,14 +65,27 @@ class _Bar:
         self._progress.advance(self._task, count)  # type: ignore[arg-type]
 
 
+_shown: Progress | None = None
+"""The bars on the terminal, while a step is under way: a step within it adds its bar there."""
+
+
 @contextmanager
 def step(title: str, total: int) -> Iterator[Step]:
     """Show a bar with elapsed and remaining time for `total` items while the block runs.
 
-    Where standard error is not a terminal it writes a line every half minute instead.
+    A step within a step has its bar below. Where standard error is not a terminal it writes a
+    line every half minute instead.
     """
+    global _shown
     if total <= 0 or not sys.stderr.isatty():
         yield _Log(title, total)
+        return
+    if _shown is not None:
+        task = _shown.add_task(title, total=total)
+        try:
+            yield _Bar(_shown, task)
+        finally:
+            _shown.remove_task(task)
         return
     columns = (
         TextColumn("{task.description}"),
@@ -83,4 +96,8 @@ def step(title: str, total: int) -> Iterator[Step]:
         TimeRemainingColumn(),
     )
     with Progress(*columns, console=console, transient=True) as progress:
-        yield _Bar(progress, progress.add_task(title, total=total))
+        _shown = progress
+        try:
+            yield _Bar(progress, progress.add_task(title, total=total))
+        finally:
+            _shown = None
