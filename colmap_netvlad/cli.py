@@ -338,6 +338,36 @@ def methods() -> None:
         click.echo(f"{method.name:{width}}  {method.summary}")
 
 
+@cli.command()
+@click.option(
+    "--output",
+    type=FOLDER,
+    default=Path("colmap-netvlad-demo"),
+    show_default=True,
+    help="Folder of the demo: new, or that of a demo to go on with.",
+)
+@click.option("--method", help="Retrieval method.  [default: as `pairs`]")
+@seed_option
+@verbose_option
+def demo(output: Path, method: str | None, seed: int) -> None:
+    """Render a small drone flight, reconstruct it, and check the result against the truth.
+
+    Takes about two minutes. Exit code 1 where a photo is not registered, or a camera centre is
+    off by more than 1 % of the flight's extent.
+    """
+    from dataclasses import replace
+
+    from rich.console import Console
+
+    from colmap_netvlad.demo.run import DEMO_FLIGHT, run_demo
+    from colmap_netvlad.models.catalogue import DEFAULT
+
+    console = Console(highlight=False, soft_wrap=True)
+    flight = replace(DEMO_FLIGHT, seed=seed)
+    if not run_demo(output, method or DEFAULT, flight, console.print).passed:
+        sys.exit(1)
+
+
 def finish_partial(left_out: list[str]) -> None:
     """List on standard error what a finished command left out, and exit with EXIT_PARTIAL."""
     if not left_out:

@@ -110,6 +110,18 @@ def render_flight(folder: Path, options: FlightOptions = FlightOptions()) -> Fli
     plans = [_plan(options, focal, block) for block in range(options.blocks)]
     size = len(plans[0][0])
     names = tuple(f"DJI_{i + 1:04d}.JPG" for i in range(size * options.blocks))
+    flight = Flight(
+        images=images,
+        names=names,
+        centres=np.concatenate([c + b * BLOCK_OFFSET for b, (c, _) in enumerate(plans)]),
+        rotations=np.concatenate([rotations for _, rotations in plans]),
+        blocks=np.repeat(np.arange(options.blocks), size),
+        width=options.width,
+        height=options.height,
+        focal=focal,
+    )
+    # First, so that a rendering which was stopped is known by its options.
+    write_atomically(folder / TRUTH_FILE, json.dumps(_truth(flight, options), indent=1) + "\n")
     with step("Rendering the flight", len(names)) as bar, ThreadPoolExecutor(2) as pool:
         for block, (centres, rotations) in enumerate(plans):
             landscape = Landscape(
@@ -137,18 +149,13 @@ def render_flight(folder: Path, options: FlightOptions = FlightOptions()) -> Fli
                 bar.advance()
 
             list(pool.map(photo, range(size)))
-    flight = Flight(
-        images=images,
-        names=names,
-        centres=np.concatenate([c + b * BLOCK_OFFSET for b, (c, _) in enumerate(plans)]),
-        rotations=np.concatenate([rotations for _, rotations in plans]),
-        blocks=np.repeat(np.arange(options.blocks), size),
-        width=options.width,
-        height=options.height,
-        focal=focal,
-    )
-    write_atomically(folder / TRUTH_FILE, json.dumps(_truth(flight), indent=1) + "\n")
     return flight
+
+
+def flight_exists(folder: Path, options: FlightOptions) -> bool:
+    """Whether `render_flight` was begun in a folder with the same options."""
+    truth = folder / TRUTH_FILE
+    return truth.is_file() and json.loads(truth.read_text()).get("options") == vars(options)
 
 
 def read_flight(folder: Path) -> Flight:
@@ -336,8 +343,9 @@ def to_wgs84(position: NDArray[np.float64]) -> tuple[float, float, float]:
     )
 
 
-def _truth(flight: Flight) -> dict[str, object]:
+def _truth(flight: Flight, options: FlightOptions) -> dict[str, object]:
     return {
+        "options": vars(options),
         "width": flight.width,
         "height": flight.height,
         "focal": flight.focal,
