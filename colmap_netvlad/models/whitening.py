@@ -51,7 +51,9 @@ class Whitening(nn.Module):
         pca.train(np.ascontiguousarray(descriptors, np.float32))
         layer = cls(inputs, dim)
         with torch.no_grad():
+            # faiss divides by the root of the sum of squares, not of the variance
+            scale = (count - 1) ** 0.5
             matrix = faiss.vector_to_array(pca.A).reshape(dim, inputs)
-            layer.weight.copy_(torch.from_numpy(matrix))
-            layer.bias.copy_(torch.from_numpy(faiss.vector_to_array(pca.b)))
+            layer.weight.copy_(scale * torch.from_numpy(matrix))
+            layer.bias.copy_(scale * torch.from_numpy(faiss.vector_to_array(pca.b)))
         return layer
