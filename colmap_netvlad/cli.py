@@ -10,15 +10,12 @@ import shlex
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import click
 
 from colmap_netvlad import __version__
 from colmap_netvlad.errors import EXIT_PARTIAL
-
-if TYPE_CHECKING:
-    from colmap_netvlad.project import Project
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
@@ -153,9 +150,12 @@ def features(images: Path, database: Path, **options: Any) -> None:
     truncated, empty or no photos are listed at the end and left out (exit code 3).
     """
     from colmap_netvlad.features import FeatureOptions, extract_features
+    from colmap_netvlad.project import Project
+    from colmap_netvlad.retrieval.store import Store
 
     report = extract_features(images, database, FeatureOptions(**options))
-    remember_images(database, images)
+    with Store(Project(database, images).cache) as store:
+        store.remember_images(images)
     click.echo(
         f"Photos: {report.photos:,}, {report.already:,} with features before, "
         f"{report.extracted:,} extracted now ({report.features:,} features), "
@@ -213,6 +213,7 @@ def reconstruct(
 
     from colmap_netvlad.mapping.options import MappingOptions
     from colmap_netvlad.matching import MatchOptions
+    from colmap_netvlad.project import find_project
     from colmap_netvlad.reconstruct import (
         ReconstructOptions,
         check_mapper,
@@ -237,26 +238,6 @@ def reconstruct(
     Console().print(report_table(report))
     click.echo("\n".join(report_lines(report)))
     click.echo(f"Matches are in {project.database}, models in {report.output}.")
-
-
-def find_project(database: Path | None, images: Path | None) -> Project:
-    """Locate the project; the photo folder used last is remembered in its cache."""
-    from colmap_netvlad.project import locate_database, open_project
-    from colmap_netvlad.retrieval.store import remembered_images
-
-    found = locate_database(database)
-    cache = found.with_suffix(".netvlad.db")
-    remembered = remembered_images(cache) if cache.exists() else None
-    return open_project(found, images, remembered)
-
-
-def remember_images(database: Path, images: Path) -> None:
-    """Keep the photo folder in the project's cache, so that later commands find it."""
-    from colmap_netvlad.project import Project
-    from colmap_netvlad.retrieval.store import IMAGES_SETTING, Store
-
-    with Store(Project(database, images).cache) as store:
-        store.remember(IMAGES_SETTING, str(images.resolve()))
 
 
 def quoted(path: Path) -> str:

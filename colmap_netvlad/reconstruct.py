@@ -158,13 +158,13 @@ def report_table(report: ReconstructReport) -> Table:
     table = Table(title=f"Sparse model in {report.output}", title_justify="left")
     table.add_column("Component")
     for column in (
-        "Registered images",
+        "Registered\nimages",
         "3D points",
-        "Reprojection error (px)",
-        "Track length",
+        "Mean reprojection\nerror (px)",
+        "Mean track\nlength",
         "Observations",
     ):
-        table.add_column(column, justify="right")
+        table.add_column(column, justify="right", no_wrap=True)
     for index, model in enumerate(report.models):
         table.add_row(str(index), *_cells(model, report.images))
     if len(report.models) > 1:

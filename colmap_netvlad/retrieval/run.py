@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +14,7 @@ from colmap_netvlad.pairs import FORMATS, ImagePair, check_k, union_of_top, writ
 from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval.methods import RetrievalOptions, rank
 from colmap_netvlad.retrieval.ranking import Ranking
-from colmap_netvlad.retrieval.store import IMAGES_SETTING, Store
+from colmap_netvlad.retrieval.store import Store
 
 SUFFIXES = {"colmap": ".txt", "csv": ".csv", "json": ".json"}
 
@@ -141,14 +140,9 @@ def _remember(project: Project, ranking: Ranking) -> None:
     """Keep the ranking and the photo folder, which as part of the workspace moves with it."""
     with Store(project.cache) as store:
         if project.images is not None:
-            store.remember(IMAGES_SETTING, _portable(project.images, project.cache.parent))
+            store.remember_images(project.images)
         if ranking.method != "exhaustive":  # all pairs in order say nothing worth keeping
             store.save_ranking(ranking)
-
-
-def _portable(folder: Path, base: Path) -> str:
-    folder, base = folder.resolve(), base.resolve()
-    return os.path.relpath(folder, base) if folder.is_relative_to(base) else str(folder)
 
 
 def _components(ranking: Ranking, pairs: list[ImagePair]) -> list[list[str]]:

@@ -219,6 +219,12 @@ class Store:
 
     # The file
 
+    def remember_images(self, folder: Path) -> None:
+        """Keep the photo folder; as part of the workspace it moves with it."""
+        folder, base = folder.resolve(), self.path.parent.resolve()
+        inside = folder.is_relative_to(base)
+        self.remember(IMAGES_SETTING, os.path.relpath(folder, base) if inside else str(folder))
+
     def _open(self) -> None:
         application = self._pragma("application_id")
         tables = self._pragma("schema_version")
