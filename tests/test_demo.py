@@ -10,9 +10,13 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+from click.testing import CliRunner
 
+from colmap_netvlad.cli import cli
 from colmap_netvlad.database import open_database
+from colmap_netvlad.demo.check import align, check_against_truth
 from colmap_netvlad.demo.render import Flight, FlightOptions, render_flight, to_wgs84
+from colmap_netvlad.demo.run import run_demo
 
 
 def test_flight_reconstructs_whole_and_within_one_percent(flight: Flight, project_copy, tmp_path):
@@ -80,3 +84,42 @@ def test_legacy_database_has_the_schema_of_colmap_3_9(legacy_database: Path, fli
     with open_database(legacy_database) as database:
         assert {image.name for image in database.images()} == set(flight.names)
         assert min(database.keypoint_counts().values()) > 100
+
+
+def test_check_is_blind_to_frame_and_scale_but_not_to_a_moved_camera(flight: Flight):
+    true = dict(zip(flight.names, flight.centres, strict=True))
+    turn = flight.rotations[0]
+    found = {name: 0.1 * turn @ centre + 5 for name, centre in true.items()}
+    moved, target = align(found, true)
+    assert np.allclose(moved, target, atol=1e-6)
+    found[flight.names[3]] = found[flight.names[3]] + 0.1 * 0.05 * flight.extent
+    moved, target = align(found, true)
+    assert np.linalg.norm(moved - target, axis=1).max() > 0.03 * flight.extent
+
+
+def test_check_fails_without_a_model(flight: Flight):
+    check = check_against_truth([], flight)
+    assert not check.passed
+    assert check.registered == 0
+
+
+def test_demo_refuses_a_folder_with_something_else_in_it(tmp_path: Path):
+    (tmp_path / "thesis.tex").write_text("precious")
+    result = CliRunner().invoke(cli, ["demo", "--output", str(tmp_path)])
+    assert result.exit_code == 1
+    assert "holds something else" in result.output
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+def test_demo_reconstructs_checks_draws_and_runs_again(tmp_path: Path):
+    options = FlightOptions(rows=3, columns=4, width=360, height=270, altitude=45.0)
+    lines: list[object] = []
+    first = run_demo(tmp_path / "demo", "vlad", options, lines.append)
+    assert first.passed
+    assert first.registered == 12
+    assert any("passed" in str(line) for line in lines)
+    picture = cv2.imread(str(tmp_path / "demo" / "result.png"))
+    assert picture.std() > 20
+    again = run_demo(tmp_path / "demo", "vlad", options, lines.append)
+    assert again.passed
+    assert np.allclose(again.errors, first.errors, atol=0.01 * first.extent)

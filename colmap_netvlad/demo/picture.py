@@ -20,15 +20,15 @@ SAMPLES = 6
 
 def draw_result(path: Path, flight: Flight, models: Sequence[pycolmap.Reconstruction]) -> None:
     """Draw sample photos, and the largest model's points and cameras in the flight's frame."""
-    figure = Figure(figsize=(12, 5.6), layout="constrained", facecolor="white")
-    left, right = figure.subfigures(1, 2, width_ratios=(1.08, 1), squeeze=False)[0]
+    figure = Figure(figsize=(12.5, 6.4), layout="constrained", facecolor="white")
+    left, right = figure.subfigures(1, 2, width_ratios=(1.12, 1), squeeze=False)[0]
     frames = left.subplots(3, 2)
     chosen = np.linspace(0, len(flight.names) - 1, SAMPLES).round().astype(int)
     for frame, i in zip(frames.flat, chosen, strict=True):
         frame.imshow(photos.imread(flight.images / flight.names[i]))
         frame.set_title(flight.names[i], fontsize=8, pad=2)
         frame.axis("off")
-    plan, side = right.subplots(2, 1, height_ratios=(4.2, 1), sharex=True)
+    plan, side = right.subplots(2, 1, height_ratios=(2, 1), sharex=True)
     largest = max(models, key=lambda model: model.num_reg_images(), default=None)
     if largest is not None:
         _draw_model(plan, side, flight, largest)
@@ -59,7 +59,7 @@ def _draw_model(plan: Axes, side: Axes, flight: Flight, model: pycolmap.Reconstr
             found[:, 0], found[:, up], ".", color="#d62728", markersize=5,
             label="reconstructed camera centres",
         )  # fmt: skip
-        axes.set_aspect("equal")
+        axes.set_aspect("equal", adjustable="datalim")
     side.scatter(places[:, 0], places[:, 2], s=1.0, c=colours, linewidths=0)
     plan.set_ylabel("north (m)")
     side.set_ylabel("up (m)")
