@@ -12,7 +12,7 @@ from colmap_netvlad.models.checkpoint import load_model
 CLUSTERS, DIM = 3, 5
 CONVOLUTIONS = {0: (3, 64), 2: (64, 64), 5: (64, 128), 7: (128, 128), 10: (128, 256)}
 CONVOLUTIONS |= {12: (256, 256), 14: (256, 256), 17: (256, 512)}
-CONVOLUTIONS |= {i: (512, 512) for i in (19, 21, 24, 26, 28)}
+CONVOLUTIONS |= dict.fromkeys((19, 21, 24, 26, 28), (512, 512))
 MEAN = (123.0, 117.0, 104.0)
 
 
@@ -113,5 +113,5 @@ def test_another_matlab_file_is_refused(tmp_path):
 def test_a_truncated_matlab_file_is_refused(matfile, tmp_path):
     path = tmp_path / "x.mat"
     path.write_bytes(matfile.read_bytes()[:5000])
-    with pytest.raises(InputError, match="x.mat"):
+    with pytest.raises(InputError, match=r"x\.mat"):
         load_model(path)
