@@ -182,7 +182,7 @@ class Landscape:
         steps = np.arange(-reach, reach, 2.0)
         roads = []
         for number in range(int(self._rng.integers(2, 5))):
-            offset = self._rng.uniform(-0.45, 0.45) * reach
+            offset = self._rng.uniform(-0.25, 0.25) * reach
             bend = self._rng.uniform(2, 9) * np.sin(steps / self._rng.uniform(30, 70) + number)
             along, across = steps, offset + bend
             line = np.stack((along, across) if number % 2 == 0 else (across, along), 1)
