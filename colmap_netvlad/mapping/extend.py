@@ -1,0 +1,72 @@
+"""Register further images into an existing model."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pycolmap
+
+from colmap_netvlad import engine, progress
+from colmap_netvlad.errors import InputError
+from colmap_netvlad.mapping.incremental import pipeline_options
+from colmap_netvlad.mapping.options import MappingOptions
+from colmap_netvlad.mapping.output import model_folder
+
+
+def read_model(folder: Path) -> pycolmap.Reconstruction:
+    """Read a COLMAP model (`cameras.bin`, `images.bin`, `points3D.bin`, or the same as text).
+
+    Raises:
+        InputError: there is none.
+    """
+    try:
+        return pycolmap.Reconstruction(folder)
+    except (ValueError, RuntimeError, OSError) as fault:
+        raise InputError(
+            f"{folder} is not a COLMAP model (cameras, images, points3D); name one with --model."
+        ) from fault
+
+
+def extend_model(
+    database: Path,
+    images: Path | None,
+    model: Path,
+    output: Path,
+    candidates: int,
+    options: MappingOptions = MappingOptions(),
+) -> pycolmap.Reconstruction:
+    """Continue incremental mapping from a model: register what the database's matches allow.
+
+    The model itself is left as it is; the extended one is written to `output`/0.
+
+    Args:
+        database: COLMAP database with the new images' verified matches.
+        images: photo folder, for the colours of points; None leaves new points black.
+        model: folder of the existing model.
+        output: folder of models; it appears whole or not at all.
+        candidates: images that may be registered, for the progress bar.
+        options: seed and threads.
+
+    Raises:
+        InputError: no model there, or `output` holds something already.
+    """
+    read_model(model)
+    pipeline = pipeline_options(options, colors=images is not None)
+    pipeline.multiple_models = False
+    with (
+        model_folder(output) as folder,
+        progress.step("Registering images", candidates) as bar,
+    ):
+        # Continuing a model, COLMAP writes straight into its output folder.
+        (folder / "0").mkdir()
+        models = engine.call(
+            pycolmap.incremental_mapping,
+            folder,
+            database,
+            images or "",
+            folder / "0",
+            options=pipeline,
+            input_path=model,
+            next_image_callback=bar.advance,
+        )
+        return models[max(models, key=lambda index: models[index].num_reg_images())]

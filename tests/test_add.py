@@ -1,0 +1,111 @@
+"""New photos cost what is new, and nothing old is lost."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from itertools import combinations
+from pathlib import Path
+
+import pytest
+
+from colmap_netvlad.add import AddOptions, add_photos, newest_model
+from colmap_netvlad.database import image_names, open_database
+from colmap_netvlad.demo.render import Flight
+from colmap_netvlad.errors import InputError
+from colmap_netvlad.features import FeatureOptions, extract_features
+from colmap_netvlad.mapping.incremental import map_incremental
+from colmap_netvlad.mapping.options import MappingOptions
+from colmap_netvlad.matching import match_pairs
+from colmap_netvlad.project import Project
+from colmap_netvlad.retrieval.methods import RetrievalOptions
+
+OPTIONS = AddOptions("vlad", RetrievalOptions(k=5), features=FeatureOptions(max_features=1500))
+NEW = 3
+
+
+@pytest.fixture(scope="module")
+def built(flight: Flight, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A reconstructed workspace of all but the last three photos. Read only."""
+    folder = tmp_path_factory.mktemp("built")
+    images = folder / "images"
+    images.mkdir()
+    for name in flight.names[:-NEW]:
+        shutil.copy(flight.images / name, images / name)
+    project = Project(folder / "project.db", images)
+    extract_features(images, project.database, OPTIONS.features)
+    match_pairs(project.database, list(combinations(image_names(project.database), 2)))
+    map_incremental(project.database, images, project.sparse, MappingOptions(min_model_size=3))
+    return folder
+
+
+@pytest.fixture
+def reconstructed(built: Path, flight: Flight, tmp_path: Path) -> tuple[Project, list[Path]]:
+    """A copy of the workspace, and the three photos it does not have."""
+    folder = Path(shutil.copytree(built, tmp_path / "workspace"))
+    photos = [flight.images / name for name in flight.names[-NEW:]]
+    return Project(folder / "project.db", folder / "images"), photos
+
+
+def test_new_photos_join_the_model_and_only_their_pairs_are_matched(
+    reconstructed: tuple[Project, list[Path]],
+) -> None:
+    project, photos = reconstructed
+    old = image_names(project.database)
+    with open_database(project.database) as database:
+        matched_before = database.matched_pairs()
+    model_before = (project.sparse / "0" / "images.bin").read_bytes()
+    assert project.images is not None
+    for photo in photos:
+        shutil.copy(photo, project.images / photo.name)
+
+    report = add_photos(project, newest_model(project), OPTIONS)
+
+    assert report.new == sorted(photo.name for photo in photos)
+    assert report.unregistered == []
+    assert report.after.registered == report.before.registered + NEW
+    assert report.matches.matched <= NEW * OPTIONS.retrieval.k
+    with open_database(project.database) as database:
+        ids = {image.name: image.image_id for image in database.images()}
+        added = database.matched_pairs() - matched_before
+    new_ids = {ids[name] for name in report.new}
+    old_ids = {ids[name] for name in old}
+    assert added
+    assert all(len({a, b} & new_ids) == 1 and len({a, b} & old_ids) == 1 for a, b in added)
+    assert (project.sparse / "0" / "images.bin").read_bytes() == model_before
+    assert newest_model(project) == report.output / "0"
+
+    with pytest.raises(InputError, match="no new photos"):
+        add_photos(project, newest_model(project), OPTIONS)
+
+
+def test_photos_in_a_folder_of_their_own_are_refused_before_anything_is_written(
+    reconstructed: tuple[Project, list[Path]], tmp_path: Path
+) -> None:
+    project, photos = reconstructed
+    elsewhere = tmp_path / "card"
+    elsewhere.mkdir()
+    shutil.copy(photos[0], elsewhere / photos[0].name)
+    before = project.database.read_bytes()
+    with pytest.raises(InputError, match="beside the old ones"):
+        add_photos(Project(project.database, elsewhere), newest_model(project), OPTIONS)
+    assert project.database.read_bytes() == before
+
+
+def test_a_broken_new_photo_is_one_sentence(reconstructed: tuple[Project, list[Path]]) -> None:
+    project, _ = reconstructed
+    assert project.images is not None
+    (project.images / "broken.jpg").write_bytes(b"")
+    with pytest.raises(InputError, match=r"None of the 1 new photos .*broken\.jpg"):
+        add_photos(project, newest_model(project), OPTIONS)
+
+
+def test_without_a_model_it_is_one_sentence(project_copy: Callable[..., Project]) -> None:
+    with pytest.raises(InputError, match="no model in"):
+        newest_model(project_copy())
+    project = project_copy(name="other")
+    project.sparse.joinpath("0").mkdir(parents=True)
+    assert project.images is not None
+    shutil.copy(project.images / "DJI_0001.JPG", project.images / "new.jpg")
+    with pytest.raises(InputError, match="is not a COLMAP model"):
+        add_photos(project, newest_model(project), OPTIONS)
