@@ -198,3 +198,25 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"real flights are not here ({folder})")
     return folder
+
+
+@pytest.fixture(scope="session")
+def tiny_checkpoint(shared_folder: Path) -> Path:
+    """A descriptor model with random weights, 64 px: small and fast, but a real one."""
+
+    def make(folder: Path) -> None:
+        import torch
+
+        from colmap_netvlad.models.aggregation import build_aggregation
+        from colmap_netvlad.models.backbones import build_trunk
+        from colmap_netvlad.models.checkpoint import save_checkpoint
+        from colmap_netvlad.models.network import GlobalDescriptor
+
+        folder.mkdir()
+        torch.manual_seed(0)
+        trunk = build_trunk("efficientnet-lite0-stage5")
+        network = GlobalDescriptor(trunk, build_aggregation(trunk.channels, {"kind": "gem"}))
+        card = {"name": "tiny", "long_side": 64, "rotations": 1}
+        save_checkpoint(folder / "tiny.safetensors", network, card)
+
+    return make_once(shared_folder / "model", make) / "tiny.safetensors"

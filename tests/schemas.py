@@ -6,6 +6,7 @@ The statements follow COLMAP's published schemas; only what differs between vers
 from __future__ import annotations
 
 import sqlite3
+from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 
@@ -74,4 +75,17 @@ def make_database(path: Path, version: str) -> None:
         for statement in statements:
             connection.execute(statement)
         connection.execute(f"PRAGMA user_version = {user_version}")
+        connection.commit()
+
+
+def add_images(path: Path, names: Sequence[str]) -> None:
+    """Add images of one camera, without features, to a database from `make_database`."""
+    with closing(sqlite3.connect(path)) as connection:
+        connection.execute(
+            "INSERT INTO cameras (camera_id, model, width, height, params, prior_focal_length)"
+            " VALUES (1, 0, 400, 300, NULL, 0)"
+        )
+        connection.executemany(
+            "INSERT INTO images (name, camera_id) VALUES (?, 1)", [(name,) for name in names]
+        )
         connection.commit()

@@ -1,0 +1,268 @@
+"""The table of retrieval methods, each run on the rendered flight."""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from schemas import add_images, make_database
+
+from colmap_netvlad.database import image_names, open_database
+from colmap_netvlad.demo.render import Flight
+from colmap_netvlad.errors import InputError
+from colmap_netvlad.project import Project
+from colmap_netvlad.retrieval import bow, methods, vlad
+from colmap_netvlad.retrieval.methods import METHODS, RetrievalOptions, find_method, rank
+from colmap_netvlad.retrieval.ranking import NO_PARTNER, Ranking
+
+MakeProject = Callable[..., Project]
+
+
+@pytest.fixture
+def checkpoint(tiny_checkpoint: Path) -> Path:
+    return tiny_checkpoint
+
+
+@pytest.fixture(autouse=True)
+def _small_trees(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(bow, "MOST_WORDS", 64)
+    monkeypatch.setenv("HOME", str(tmp_path))  # no published tree of this machine's user
+
+
+def check_ranking(ranking: Ranking, count: int, depth: int) -> None:
+    assert ranking.partners.shape == (count, depth)
+    for i, row in enumerate(ranking.partners.tolist()):
+        assert sorted({i, *row}) == sorted([i, *row])
+        assert NO_PARTNER not in row
+    assert (np.diff(ranking.scores, axis=1) <= 0).all()
+
+
+@pytest.mark.parametrize("name", ["vlad", "bow", "random", "exhaustive", "spatial"])
+def test_each_method_ranks_every_image_of_the_flight(name: str, project_copy: MakeProject) -> None:
+    ranking = rank(project_copy(), name, RetrievalOptions(k=5))
+    assert ranking.method == name
+    check_ranking(ranking, 12, {"bow": 11, "exhaustive": 11}.get(name, 5))
+
+
+@pytest.mark.parametrize("name", ["vlad", "bow", "random"])
+def test_each_method_gives_the_same_ranking_twice(name: str, project_copy: MakeProject) -> None:
+    first, second = (
+        rank(project_copy(name=workspace), name, RetrievalOptions(k=11))
+        for workspace in ("first", "second")
+    )
+    np.testing.assert_array_equal(first.partners, second.partners)
+
+
+@pytest.mark.parametrize("name", ["vlad", "bow"])
+def test_what_sees_the_photos_beats_chance(
+    name: str, project_copy: MakeProject, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bow, "MOST_WORDS", 512)
+    project = project_copy(matched=True)
+    with open_database(project.database) as database:
+        rows = {image.image_id: i for i, image in enumerate(database.images())}
+        matches = np.zeros((12, 12))
+        for (a, b), count in database.verified_matches().items():
+            matches[rows[a], rows[b]] = matches[rows[b], rows[a]] = count
+    ranking = rank(project, name, RetrievalOptions(k=3)).top(3)
+    retrieved = np.take_along_axis(matches, ranking.partners, axis=1).mean()
+    by_chance = matches.sum() / (12 * 11)
+    assert retrieved > 1.5 * by_chance
+
+
+def test_a_checkpoint_by_path_is_a_method(project_copy: MakeProject, checkpoint: Path) -> None:
+    ranking = rank(project_copy(), str(checkpoint), RetrievalOptions(k=4))
+    check_ranking(ranking, 12, 4)
+    assert ranking.method == "tiny"
+    assert ranking.notes == ("12 of 12 descriptors computed",)
+    assert ranking.seconds_describe > 0
+
+
+def test_a_second_run_computes_nothing_and_ranks_the_same(
+    project_copy: MakeProject, checkpoint: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    project = project_copy()
+    first = rank(project, checkpoint, RetrievalOptions(k=4))
+
+    def refuse(*_: object) -> None:
+        raise AssertionError("the model was loaded")
+
+    monkeypatch.setattr("colmap_netvlad.models.checkpoint.load_model", refuse)
+    second = rank(project, checkpoint, RetrievalOptions(k=4))
+    assert second.notes[0].startswith("0 of 12 descriptors computed")
+    assert second.seconds_describe == pytest.approx(first.seconds_describe)
+    np.testing.assert_array_equal(first.partners, second.partners)
+
+
+def test_new_and_changed_photos_alone_are_computed(
+    project_copy: MakeProject, checkpoint: Path
+) -> None:
+    project = project_copy(copy_photos=True)
+    assert project.images is not None
+    names = image_names(project.database)
+    aside = project.folder / "aside.jpg"
+    (project.images / names[0]).rename(aside)
+    first = rank(project, checkpoint, RetrievalOptions(k=4))
+    assert first.left_out == ((names[0], "is missing"),)
+    assert (first.partners[0] == NO_PARTNER).all()
+    assert 0 not in first.partners
+    aside.rename(project.images / names[0])
+    shutil.copy(project.images / names[2], project.images / names[1])
+    second = rank(project, checkpoint, RetrievalOptions(k=4))
+    assert second.notes[0].startswith("2 of 12 descriptors computed")
+    assert second.left_out == ()
+    # The copy now lies nearest to its original.
+    assert second.partners[2, 0] == 1
+    assert second.partners[1, 0] == 2
+
+
+def test_bad_photos_are_left_out_with_a_reason_and_stop_nothing(
+    project_copy: MakeProject, checkpoint: Path
+) -> None:
+    project = project_copy(copy_photos=True)
+    assert project.images is not None
+    names = image_names(project.database)
+    whole = (project.images / names[1]).read_bytes()
+    (project.images / names[0]).write_bytes(b"")
+    (project.images / names[1]).write_bytes(whole[: len(whole) // 2])
+    (project.images / names[2]).write_text("no photo")
+    ranking = rank(project, checkpoint, RetrievalOptions(k=11))
+    assert dict(ranking.left_out).keys() == set(names[:3])
+    assert all(dict(ranking.left_out).values())
+    assert ranking.partners.shape == (12, 8)
+    assert not np.isin(ranking.partners[3:], [0, 1, 2]).any()
+
+
+def test_no_usable_photo_at_all_is_one_sentence(
+    project_copy: MakeProject, checkpoint: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "empty").mkdir()
+    project = replace(project_copy(), images=tmp_path / "empty")
+    with pytest.raises(InputError, match=r"None of the 12 photos .*is missing.*--images"):
+        rank(project, checkpoint)
+
+
+def test_a_killed_description_goes_on_where_it_stopped(
+    project_copy: MakeProject, checkpoint: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from colmap_netvlad.models.describe import DescriptorModel
+
+    project = project_copy()
+    describe, calls = DescriptorModel.describe, []
+
+    def describe_twice(self: DescriptorModel, pixels: np.ndarray) -> np.ndarray:
+        calls.append(len(pixels))
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return describe(self, pixels)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(DescriptorModel, "describe", describe_twice)
+        with pytest.raises(KeyboardInterrupt):
+            rank(project, checkpoint, RetrievalOptions(k=4, batch_size=2))
+    ranking = rank(project, checkpoint, RetrievalOptions(k=4, batch_size=2))
+    assert ranking.notes[0].startswith("8 of 12 descriptors computed")
+
+
+def test_vlad_describes_new_images_only(project_copy: MakeProject) -> None:
+    project = project_copy()
+    rank(project, "vlad", RetrievalOptions(k=3))
+    again = rank(project, "vlad", RetrievalOptions(k=3))
+    assert again.notes[0].startswith("0 of 12 descriptors computed")
+
+
+def test_vlad_follows_its_definition() -> None:
+    generator = np.random.default_rng(0)
+    descriptors = generator.integers(0, 255, (30, 128)).astype(np.uint8)
+    words = generator.uniform(0, 255, (4, 128)).astype(np.float32)
+    expected = np.zeros((4, 128))
+    for descriptor in descriptors.astype(float):
+        word = np.argmin(((descriptor - words) ** 2).sum(axis=1))
+        expected[word] += descriptor - words[word]
+    expected = np.sign(expected) * np.sqrt(np.abs(expected))
+    norms = np.linalg.norm(expected, axis=1, keepdims=True)
+    expected = (expected / np.maximum(norms, 1e-12)).ravel()
+    expected /= np.linalg.norm(expected)
+    np.testing.assert_allclose(vlad.describe(descriptors, words), expected, atol=1e-4)
+
+
+@pytest.mark.parametrize("name", ["vlad", "bow"])
+def test_a_database_without_features_is_said(name: str, tmp_path: Path) -> None:
+    project = Project(tmp_path / "project.db", None)
+    make_database(project.database, "4.2")
+    add_images(project.database, ["a.jpg", "b.jpg"])
+    with pytest.raises(InputError, match=r"no local features.*colmap-netvlad features"):
+        rank(project, name)
+
+
+def test_bow_leaves_the_database_alone_and_says_which_tree(project_copy: MakeProject) -> None:
+    project = project_copy(matched=True)
+    before = hashlib.sha256(project.database.read_bytes()).hexdigest()
+    ranking = rank(project, "bow", RetrievalOptions(k=3))
+    assert "built from this project's own descriptors" in ranking.notes[0]
+    assert hashlib.sha256(project.database.read_bytes()).hexdigest() == before
+    (tree,) = project.folder.glob("*.bin")
+    built = tree.stat().st_mtime_ns
+    again = rank(project, "bow", RetrievalOptions(k=3))
+    assert tree.stat().st_mtime_ns == built
+    np.testing.assert_array_equal(ranking.partners, again.partners)
+    given = rank(project, "bow", RetrievalOptions(k=3, vocab_tree=tree))
+    assert given.notes == (f"vocabulary tree {tree}",)
+    np.testing.assert_array_equal(ranking.partners, given.partners)
+
+
+def test_a_tree_that_is_not_one_is_refused(project_copy: MakeProject, tmp_path: Path) -> None:
+    project = project_copy()
+    with pytest.raises(InputError, match="does not exist"):
+        rank(project, "bow", RetrievalOptions(vocab_tree=tmp_path / "none.bin"))
+    wrong = tmp_path / "flann.bin"
+    wrong.write_bytes(b"FLANN" * 100)
+    with pytest.raises(InputError, match="not a vocabulary tree that COLMAP 4 reads"):
+        rank(project, "bow", RetrievalOptions(vocab_tree=wrong))
+
+
+def test_spatial_ranks_by_true_distance(project_copy: MakeProject, flight: Flight) -> None:
+    project = project_copy()
+    ranking = rank(project, "spatial", RetrievalOptions(k=3))
+    centres = np.array([flight.centres[flight.names.index(n)][:2] for n in ranking.names])
+    distances = np.linalg.norm(centres[:, None] - centres[None], axis=2)
+    for i, row in enumerate(ranking.partners.tolist()):
+        others = np.sort(np.delete(distances[i], i))[:3]
+        np.testing.assert_allclose(distances[i, row], others, rtol=0.05, atol=0.5)
+
+
+def test_k_above_the_number_of_images_is_lowered_with_a_note(project_copy: MakeProject) -> None:
+    ranking = rank(project_copy(), "random", RetrievalOptions(k=50))
+    check_ranking(ranking, 12, 11)
+    assert ranking.notes[-1] == "k lowered from 50 to 11: the project has 12 images"
+
+
+@pytest.mark.parametrize("k", [0, -3])
+def test_k_below_one_is_refused(k: int, project_copy: MakeProject) -> None:
+    with pytest.raises(InputError, match=f"--k is {k}"):
+        rank(project_copy(), "random", RetrievalOptions(k=k))
+
+
+@pytest.mark.parametrize(
+    ("name", "hint"),
+    [("bwo", "did you mean bow"), ("VLAD", "did you mean vlad"), ("xyzzy", "methods are")],
+)
+def test_an_unknown_method_suggests_the_nearest(name: str, hint: str) -> None:
+    with pytest.raises(InputError, match=hint):
+        find_method(name)
+
+
+def test_a_missing_checkpoint_is_said() -> None:
+    with pytest.raises(InputError, match=r"none\.safetensors does not exist"):
+        find_method("none.safetensors")
+
+
+def test_every_method_has_one_line_of_help() -> None:
+    assert all(m.summary and "\n" not in m.summary for m in METHODS.values())
+    assert {"bow", "vlad", "spatial", "exhaustive", "random"} <= METHODS.keys()
+    assert methods.CHECKPOINT_SUFFIXES
