@@ -171,19 +171,15 @@ def _match_under_aliases(database: Path, pairs: Sequence[IdPair], options: Match
 def _copy_features(source: Path, target: Path, aliases: dict[int, str]) -> None:
     with closing(sqlite3.connect(target)) as connection:
         connection.execute("ATTACH ? AS source", (f"{source.resolve()}",))
-        connection.execute("CREATE TEMP TABLE wanted (image_id INTEGER PRIMARY KEY, name TEXT)")
+        connection.execute("CREATE TEMP TABLE wanted (image_id INTEGER PRIMARY KEY, alias TEXT)")
         connection.executemany("INSERT INTO wanted VALUES (?, ?)", aliases.items())
-        connection.execute("INSERT INTO cameras SELECT * FROM source.cameras")
+        _copy_rows(connection, "cameras")
         connection.execute(
             "INSERT INTO images (image_id, name, camera_id)"
-            " SELECT image_id, wanted.name, camera_id FROM source.images JOIN wanted"
-            " USING (image_id)"
+            " SELECT image_id, alias, camera_id FROM source.images JOIN wanted USING (image_id)"
         )
         for table in ("keypoints", "descriptors"):
-            connection.execute(
-                f"INSERT INTO {table} SELECT * FROM source.{table}"
-                " WHERE image_id IN (SELECT image_id FROM wanted)"
-            )
+            _copy_rows(connection, table, "WHERE image_id IN (SELECT image_id FROM wanted)")
         connection.commit()
 
 
@@ -194,9 +190,14 @@ def _copy_matches(source: Path, target: Path, pairs: Sequence[int]) -> None:
         connection.execute("CREATE TEMP TABLE wanted (pair_id INTEGER PRIMARY KEY)")
         connection.executemany("INSERT INTO wanted VALUES (?)", [(pair,) for pair in pairs])
         for table in ("matches", "two_view_geometries"):
-            columns = ", ".join(row[1] for row in connection.execute(f"PRAGMA table_info({table})"))
-            connection.execute(
-                f"INSERT OR REPLACE INTO main.{table} ({columns}) SELECT {columns}"
-                f" FROM source.{table} WHERE pair_id IN (SELECT pair_id FROM wanted)"
-            )
+            _copy_rows(connection, table, "WHERE pair_id IN (SELECT pair_id FROM wanted)")
         connection.commit()
+
+
+def _copy_rows(connection: sqlite3.Connection, table: str, where: str = "") -> None:
+    """Copy rows by column name: a migrated database has the same columns in another order."""
+    columns = ", ".join(row[1] for row in connection.execute(f"PRAGMA main.table_info({table})"))
+    connection.execute(
+        f"INSERT OR REPLACE INTO main.{table} ({columns})"
+        f" SELECT {columns} FROM source.{table} {where}"
+    )

@@ -1,0 +1,153 @@
+"""Pairs -> matches in the database."""
+
+from __future__ import annotations
+
+import itertools
+import sqlite3
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from colmap_netvlad import engine, matching
+from colmap_netvlad.database import image_names, open_database, pair_id
+from colmap_netvlad.errors import InputError
+from colmap_netvlad.matching import match_pairs
+from colmap_netvlad.project import Project
+
+MakeProject = Callable[..., Project]
+
+
+def some_pairs(database: Path, images: int = 4) -> list[tuple[str, str]]:
+    return list(itertools.combinations(image_names(database)[:images], 2))
+
+
+def results(database: Path) -> dict[int, tuple[object, ...]]:
+    """Every row of both tables of matches, by pair."""
+    with closing(sqlite3.connect(database)) as connection:
+        return {
+            row[0]: row[1:]
+            for row in connection.execute(
+                "SELECT m.pair_id, m.rows, m.data, g.rows, g.data, g.config, g.F, g.E, g.H"
+                " FROM matches m JOIN two_view_geometries g USING (pair_id)"
+            )
+        }
+
+
+def rename(database: Path, names: list[str]) -> None:
+    with closing(sqlite3.connect(database)) as connection:
+        ids = [row[0] for row in connection.execute("SELECT image_id FROM images ORDER BY 1")]
+        connection.executemany(
+            "UPDATE images SET name = ? WHERE image_id = ?", zip(names, ids, strict=False)
+        )
+        connection.commit()
+
+
+def test_pairs_are_matched_and_verified_and_nothing_else(project_copy: MakeProject) -> None:
+    database = project_copy().database
+    pairs = some_pairs(database)
+    report = match_pairs(database, [*pairs, pairs[0][::-1]])
+    assert (report.requested, report.already, report.matched) == (6, 0, 6)
+    assert 3 <= report.verified <= 6 and report.seconds > 0
+    with open_database(database) as colmap:
+        assert len(colmap.matched_pairs()) == 6
+        assert sum(count > 15 for count in colmap.verified_matches().values()) >= 3
+
+
+def test_pairs_matched_before_are_not_matched_again(
+    project_copy: MakeProject, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    database = project_copy().database
+    first = match_pairs(database, some_pairs(database))
+    before = results(database)
+    monkeypatch.setattr(engine, "call", lambda *_, **__: pytest.fail("COLMAP was called"))
+    again = match_pairs(database, some_pairs(database))
+    assert (again.already, again.matched, again.verified) == (6, 0, first.verified)
+    assert results(database) == before
+
+
+def test_names_with_spaces_and_hashes_match_as_any_others(project_copy: MakeProject) -> None:
+    plain = project_copy(name="plain").database
+    odd = project_copy(name="odd names #1").database
+    rename(odd, ["a b.jpg", "#c.jpg", "写真 2.jpg", "b.jpg", "a"])
+    pairs = some_pairs(odd)
+    assert pairs[0] == ("a b.jpg", "#c.jpg")
+    report = match_pairs(odd, pairs)
+    match_pairs(plain, some_pairs(plain))
+    assert report.matched == 6
+    assert results(odd) == results(plain) and len(results(odd)) == 6
+    with open_database(odd) as colmap:
+        assert {row.name for row in colmap.images()} >= {"a b.jpg", "#c.jpg", "写真 2.jpg", "b.jpg"}
+
+
+def test_matches_are_the_same_twice_and_in_chunks_of_any_size(
+    project_copy: MakeProject, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one, two = (project_copy(name=name).database for name in ("one", "two"))
+    match_pairs(one, some_pairs(one))
+    monkeypatch.setattr(matching, "FIRST_CHUNK", 1)
+    monkeypatch.setattr(matching, "CHUNK_SECONDS", 0.0)
+    match_pairs(two, some_pairs(two)[::-1])
+    assert results(one) == results(two)
+
+
+def test_a_stopped_run_goes_on_with_the_pairs_left(
+    project_copy: MakeProject, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    database = project_copy().database
+    monkeypatch.setattr(matching, "FIRST_CHUNK", 4)
+    calls = 0
+
+    def stop_at_the_second(*arguments: object, **options: object) -> object:
+        nonlocal calls
+        calls += 1
+        if calls == 2:
+            raise KeyboardInterrupt
+        return call(*arguments, **options)
+
+    call = engine.call
+    monkeypatch.setattr(engine, "call", stop_at_the_second)
+    with pytest.raises(KeyboardInterrupt):
+        match_pairs(database, some_pairs(database))
+    assert len(results(database)) == 4
+    report = match_pairs(database, some_pairs(database))
+    assert (report.already, report.matched) == (4, 2)
+
+
+@pytest.mark.parametrize("spaces", [False, True])
+def test_a_3x_database_is_brought_up_to_date_and_matched(
+    spaces: bool, legacy_database: Path
+) -> None:
+    if spaces:
+        rename(legacy_database, ["a b.jpg", "a c.jpg"])
+    report = match_pairs(legacy_database, some_pairs(legacy_database, 3))
+    assert report.matched == 3 and report.verified >= 2
+    with closing(sqlite3.connect(legacy_database)) as connection:
+        assert connection.execute("PRAGMA user_version").fetchone()[0] >= 4_000_000
+
+
+def test_unknown_names_and_missing_features_are_said(project_copy: MakeProject) -> None:
+    database = project_copy().database
+    name = image_names(database)[0]
+    with pytest.raises(InputError, match=r"has no image gone\.jpg"):
+        match_pairs(database, [(name, "gone.jpg")])
+    with closing(sqlite3.connect(database)) as connection:
+        connection.execute("DELETE FROM keypoints")
+        connection.execute("DELETE FROM descriptors")
+        connection.commit()
+    with pytest.raises(InputError, match="colmap-netvlad features"):
+        match_pairs(database, some_pairs(database))
+
+
+def test_one_image_without_features_fails_its_pairs_only(project_copy: MakeProject) -> None:
+    database = project_copy().database
+    with closing(sqlite3.connect(database)) as connection:
+        connection.execute("DELETE FROM keypoints WHERE image_id = 1")
+        connection.execute("DELETE FROM descriptors WHERE image_id = 1")
+        connection.commit()
+    report = match_pairs(database, some_pairs(database, 3))
+    assert report.requested == 3 and report.verified >= 1
+    with open_database(database) as colmap:
+        assert colmap.verified_matches().get((1, 2), 0) == 0
+    assert pair_id(2, 3) in results(database)
