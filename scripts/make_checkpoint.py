@@ -102,7 +102,7 @@ def sample_features(
     """L2-normalised local features, float32 (M, channels), drawn at random from each photo."""
     generator = torch.Generator().manual_seed(seed)
     device = choose_device()
-    precision = choose_precision(device, trunk.name)
+    precision = choose_precision(device)
     fast = prepare_trunk(trunk, device, precision)
     drawn = []
     with progress.step("Local features", len(photos)) as bar:

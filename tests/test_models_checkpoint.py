@@ -65,7 +65,7 @@ def test_checkpoint_brings_back_network_and_card(checkpoint, network, photos):
     assert found.dtype == np.float32
     with torch.inference_mode():
         expected = network(torch.from_numpy(photos).float()).numpy()
-    assert (found * expected).sum(axis=1).min() > 0.999  # float16 on disk
+    assert (found * expected).sum(axis=1).min() > 0.995  # float16 on disk, bfloat16 in the trunk
     np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, atol=1e-5)
 
 
@@ -85,7 +85,9 @@ def test_half_checkpoint_keeps_batch_norm_statistics_exact(checkpoint, network):
 
 
 @pytest.mark.parametrize("kind", ["gem", "max"])
-def test_every_aggregation_and_a_whitening_survive_the_round_trip(kind, tmp_path, photos):
+def test_every_aggregation_and_a_whitening_survive_the_round_trip(
+    kind, tmp_path, photos, monkeypatch
+):
     trunk = build_trunk("efficientnet-lite0-stage5")
     aggregation = build_aggregation(trunk.channels, {"kind": kind})
     whitening = Whitening.fit(
@@ -94,6 +96,7 @@ def test_every_aggregation_and_a_whitening_survive_the_round_trip(kind, tmp_path
     network = GlobalDescriptor(trunk, aggregation, whitening).eval()
     path = tmp_path / "model.safetensors"
     save_checkpoint(path, network, CARD, half=False)
+    monkeypatch.setattr(describe, "has_bfloat16_hardware", lambda: False)
     model = load_model(path, "cpu")
     assert model.dim == 16
     with torch.inference_mode():
@@ -270,16 +273,15 @@ def test_a_device_that_does_not_exist_is_said(checkpoint, name):
 def test_cuda_is_chosen_where_it_is(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     assert describe.choose_device().type == "cuda"
-    assert describe.choose_precision(torch.device("cuda"), "vgg16") == torch.float16
+    assert describe.choose_precision(torch.device("cuda")) == torch.float16
 
 
 def test_bfloat16_only_where_the_processor_gains_from_it(monkeypatch):
     cpu = torch.device("cpu")
     monkeypatch.setattr(describe, "has_bfloat16_hardware", lambda: True)
-    assert describe.choose_precision(cpu, "vgg16") == torch.bfloat16
-    assert describe.choose_precision(cpu, "efficientnet-lite0-stage5") == torch.float32
+    assert describe.choose_precision(cpu) == torch.bfloat16
     monkeypatch.setattr(describe, "has_bfloat16_hardware", lambda: False)
-    assert describe.choose_precision(cpu, "vgg16") == torch.float32
+    assert describe.choose_precision(cpu) == torch.float32
 
 
 # Named models
