@@ -115,7 +115,7 @@ class ViewGraph:
             images=len(self.names),
             edges=len(self.edges),
             component_sizes=tuple(len(members) for members in self.components()),
-            degree_min=int(degrees.min(initial=0)) if len(degrees) else 0,
+            degree_min=int(degrees.min()) if len(degrees) else 0,
             degree_median=float(np.median(degrees)) if len(degrees) else 0.0,
             degree_mean=float(degrees.mean()) if len(degrees) else 0.0,
             degree_max=int(degrees.max(initial=0)),

@@ -181,6 +181,7 @@ def test_a_star_hangs_on_its_centre_and_a_chain_on_every_inner_image() -> None:
     assert chain.articulation_images() == ["b", "c"]
     ring = graph_of("abcd", ("a", "b"), ("b", "c"), ("c", "d"), ("a", "d"))
     assert (ring.bridges(), ring.articulation_images()) == ([], [])
+    assert (ring.statistics().degree_min, ring.statistics().degree_max) == (2, 2)
 
 
 def test_an_empty_graph_has_empty_figures() -> None:

@@ -9,6 +9,8 @@ import pycolmap
 
 from colmap_netvlad.mapping.incremental import map_incremental
 from colmap_netvlad.mapping.options import MappingOptions
+from colmap_netvlad.mapping.parallel import map_parallel
+from colmap_netvlad.mapping.pipelines import map_automatic, map_global, map_hierarchical
 
 
 class Mapper(Protocol):
@@ -20,5 +22,11 @@ class Mapper(Protocol):
         """Reconstruct the images of `database`."""
 
 
-MAPPERS: dict[str, Mapper] = {"incremental": map_incremental}
+MAPPERS: dict[str, Mapper] = {
+    "auto": map_automatic,
+    "incremental": map_incremental,
+    "parallel": map_parallel,
+    "hierarchical": map_hierarchical,
+    "global": map_global,
+}
 """Name of `reconstruct --mapper` -> the mapper."""

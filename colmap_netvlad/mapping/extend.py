@@ -63,7 +63,7 @@ def extend_model(
             pycolmap.incremental_mapping,
             folder,
             database,
-            images or "",
+            images or folder,
             folder / "0",
             options=pipeline,
             input_path=model,

@@ -42,7 +42,7 @@ def map_incremental(
             pycolmap.incremental_mapping,
             folder,
             database,
-            images or "",
+            images or folder,
             folder,
             options=pipeline_options(options, colors=images is not None),
             initial_image_pair_callback=lambda: bar.advance(2),

@@ -16,9 +16,15 @@ class MappingOptions:
         threads: threads; None: all processors. Above 50,000 residuals COLMAP's bundle adjustment
             adds in the order its threads finish, so only one thread gives the same last digits
             twice.
+        cluster_size: images of a cluster of `parallel` and `hierarchical` before it is expanded
+            for overlap; None: a measured default.
+        memory: bytes that the workers of `parallel` may take together; None: a share of the
+            machine's.
     """
 
     seed: int = 0
     min_model_size: int = 10
     max_models: int = 50
     threads: int | None = None
+    cluster_size: int | None = None
+    memory: float | None = None

@@ -1,0 +1,373 @@
+"""Parallel SfM (section 2.2 of the paper): cut, reconstruct clusters at once, merge, adjust.
+
+Every cluster is mapped in a process of its own from a small database of its own. Finished
+clusters are kept in a folder beside the output until the model is written, so a killed run goes
+on where it stopped.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import pycolmap
+
+from colmap_netvlad import progress
+from colmap_netvlad.engine import usable_processors
+from colmap_netvlad.errors import InputError
+from colmap_netvlad.files import write_atomically
+from colmap_netvlad.mapping import workers
+from colmap_netvlad.mapping.incremental import pipeline_options
+from colmap_netvlad.mapping.merge import merge, read_sub_model
+from colmap_netvlad.mapping.options import MappingOptions
+from colmap_netvlad.mapping.output import model_folder
+from colmap_netvlad.mapping.partition import Cluster, partition
+from colmap_netvlad.mapping.refine import load_cache, rebuild, refine
+from colmap_netvlad.mapping.subset import write_subset
+from colmap_netvlad.viewgraph import ViewGraph, read_view_graph
+
+CLUSTER_IMAGES = 150
+"""Default size of a cluster before it is expanded (measured, see docs/parallel-sfm.md)."""
+
+MIN_CLUSTER_MODEL = 3
+"""Smaller models of a cluster do not help to merge."""
+
+WORKER_BYTES = 200 * 2**20
+"""Memory of a worker before it loads anything: Python and pycolmap."""
+
+BYTES_PER_DATABASE_BYTE = 8.0
+"""Memory of a worker for each byte of its cluster's database."""
+
+MEMORY_SHARE = 0.7
+"""Share of the machine's memory that workers may take when no limit is given."""
+
+
+@dataclass
+class ClusterReport:
+    """How one cluster went.
+
+    Attributes:
+        images: images in the cluster, shared ones included.
+        models: images registered in each of its models.
+        fault: why it failed, or None.
+    """
+
+    images: int
+    models: list[int] = field(default_factory=list)
+    fault: str | None = None
+
+
+@dataclass
+class ParallelReport:
+    """What parallel SfM did beside the models.
+
+    Attributes:
+        clusters: one report a cluster, in the partition's order.
+        reused: clusters that an earlier, stopped run had finished.
+        members: for each model, the sub-models it was merged from.
+        refused: sub-models that share points with a larger one but do not fit, with the reason.
+        joined_later: images that no merged sub-model had, registered afterwards.
+        peak_bytes: the most memory any worker held.
+    """
+
+    clusters: list[ClusterReport]
+    reused: int = 0
+    members: list[list[str]] = field(default_factory=list)
+    refused: list[tuple[str, str]] = field(default_factory=list)
+    joined_later: int = 0
+    peak_bytes: int = 0
+
+
+def map_parallel(
+    database: Path,
+    images: Path | None,
+    output: Path,
+    options: MappingOptions = MappingOptions(),
+) -> list[pycolmap.Reconstruction]:
+    """Reconstruct a large flight in clusters and write `output`/0, 1, ...
+
+    What was left out (failed clusters, refused sub-models) is said on standard error;
+    `reconstruct_parallel` returns it.
+
+    Args:
+        database: COLMAP database with verified matches; it is not changed.
+        images: photo folder, for the colours of points; None leaves them black.
+        output: folder of the models; it appears whole, or not at all on a fault or Ctrl-C.
+        options: seed, threads, size of a cluster, memory.
+
+    Returns:
+        The models, largest first; empty where nothing could be reconstructed.
+
+    Raises:
+        InputError: `output` holds something already, or no cluster could be reconstructed
+            because all of them failed.
+    """
+    models, report = reconstruct_parallel(database, images, output, options)
+    for line in report_lines(report):
+        progress.console.print(line, highlight=False, markup=False)
+    return models
+
+
+def reconstruct_parallel(
+    database: Path,
+    images: Path | None,
+    output: Path,
+    options: MappingOptions = MappingOptions(),
+) -> tuple[list[pycolmap.Reconstruction], ParallelReport]:
+    """Reconstruct in clusters (see `map_parallel`) and return models and report."""
+    with model_folder(output) as folder:
+        graph = read_view_graph(database)
+        clusters = partition(graph, options.cluster_size or CLUSTER_IMAGES)
+        state = open_state(output, graph, clusters, options)
+        report = map_clusters(database, clusters, state, options)
+        merge_clusters(database, images, state, folder, options, report)
+        models = [pycolmap.Reconstruction(path) for path in _numbered(folder)]
+    shutil.rmtree(state, ignore_errors=True)
+    return models, report
+
+
+def report_lines(report: ParallelReport) -> list[str]:
+    """Return one line for everything that did not go to plan."""
+    lines = [
+        f"Cluster {number} ({cluster.images} images) failed: {cluster.fault}. "
+        "Its images are registered into the model where they can be."
+        for number, cluster in enumerate(report.clusters)
+        if cluster.fault
+    ]
+    lines += [
+        f"Sub-model {name} was not merged: {reason}. "
+        "Its images are registered into the model where they can be."
+        for name, reason in report.refused
+    ]
+    return lines
+
+
+def open_state(
+    output: Path, graph: ViewGraph, clusters: Sequence[Cluster], options: MappingOptions
+) -> Path:
+    """Return the folder of finished clusters, emptied if it belongs to other input.
+
+    It lies beside `output` and holds a fingerprint of the view graph, the clusters and what the
+    clusters' mappers are told.
+    """
+    state = output.parent / f".{output.name}.clusters"
+    digest = hashlib.sha256()
+    told = {key: value for key, value in asdict(options).items() if key in ("seed", "max_models")}
+    digest.update(json.dumps([graph.names, told, pycolmap.__version__]).encode())
+    digest.update(json.dumps([cluster.images for cluster in clusters]).encode())
+    for array in (graph.edges, graph.inliers, graph.weights):
+        digest.update(array.tobytes())
+    mark = state / "fingerprint"
+    if not (mark.is_file() and mark.read_text() == digest.hexdigest()):
+        shutil.rmtree(state, ignore_errors=True)
+        write_atomically(mark, digest.hexdigest())
+    for stray in state.glob("*.part"):
+        shutil.rmtree(stray, ignore_errors=True)
+    return state
+
+
+def map_clusters(
+    database: Path, clusters: Sequence[Cluster], state: Path, options: MappingOptions
+) -> ParallelReport:
+    """Map clusters that are not finished yet, several at once.
+
+    Each finished cluster is the folder `state`/<number> with models 0, 1, ... A cluster that
+    fails leaves none and is reported; the others go on.
+
+    Raises:
+        InputError: all of them failed.
+    """
+    report = ParallelReport([ClusterReport(len(cluster.images)) for cluster in clusters])
+    todo = [number for number in range(len(clusters)) if not (state / str(number)).is_dir()]
+    report.reused = len(clusters) - len(todo)
+    parts = {number: Path(tempfile.mkdtemp(suffix=".part", dir=state)) for number in todo}
+    largest = max((len(clusters[number].images) for number in todo), default=0)
+    count = worker_count(database, largest, len(todo), options)
+    threads = max(1, (options.threads or usable_processors()) // max(count, 1))
+    jobs = [
+        workers.Job(
+            map_cluster, (database, parts[number], clusters[number].images, options, threads)
+        )
+        for number in todo
+    ]
+
+    def finished(job: int, outcome: workers.Outcome) -> None:
+        number = todo[job]
+        report.clusters[number].fault = outcome.fault
+        report.peak_bytes = max(report.peak_bytes, outcome.peak_bytes)
+        if outcome.fault is None:
+            parts[number].rename(state / str(number))
+
+    total = sum(len(cluster.images) for cluster in clusters)
+    try:
+        with progress.step(f"Mapping {len(clusters)} clusters", total) as bar:
+            bar.advance(total - sum(len(clusters[number].images) for number in todo))
+            workers.run(jobs, count, bar.advance, finished)
+    finally:
+        for part in parts.values():
+            shutil.rmtree(part, ignore_errors=True)
+    faults = [cluster.fault for cluster in report.clusters if cluster.fault]
+    if faults and len(faults) == len(clusters):
+        raise InputError(f"None of the {len(clusters)} clusters could be mapped: {faults[0]}.")
+    return report
+
+
+def map_cluster(
+    advance: Callable[[int], None],
+    database: Path,
+    folder: Path,
+    names: Sequence[str],
+    options: MappingOptions,
+    threads: int,
+) -> None:
+    """Map one cluster into `folder`/0, 1, ... (in a worker)."""
+    subset = folder / "cluster.db"
+    write_subset(database, subset, names)
+    pipeline = pipeline_options(options, colors=False)
+    pipeline.min_model_size = MIN_CLUSTER_MODEL
+    pipeline.num_threads = pipeline.mapper.num_threads = threads
+    pycolmap.incremental_mapping(
+        subset,
+        folder,  # photos are not read, but the folder has to exist
+        folder,
+        options=pipeline,
+        initial_image_pair_callback=lambda: advance(2),
+        next_image_callback=lambda: advance(1),
+    )
+    subset.unlink()
+
+
+def merge_clusters(
+    database: Path,
+    images: Path | None,
+    state: Path,
+    folder: Path,
+    options: MappingOptions,
+    report: ParallelReport,
+) -> None:
+    """Merge the clusters in `state` into models `folder`/0, 1, ... and complete `report`.
+
+    It runs in a worker too, so that Ctrl-C ends a long bundle adjustment at once.
+
+    Raises:
+        InputError: the worker failed.
+    """
+    finished = {path: _numbered(path) for path in _numbered(state)}
+    for path, models in finished.items():
+        report.clusters[int(path.name)].models = [_registered(model) for model in models]
+    missing = sum(cluster.images for cluster in report.clusters)
+    with progress.step("Merging and adjusting", missing) as bar:
+        job = workers.Job(
+            merge_models,
+            (
+                database,
+                images,
+                [m for models in finished.values() for m in models],
+                folder,
+                options,
+            ),
+        )
+        (outcome,) = workers.run([job], 1, bar.advance)
+    report.peak_bytes = max(report.peak_bytes, outcome.peak_bytes)
+    if outcome.fault is not None:
+        raise InputError(
+            f"The {len(finished)} clusters were mapped, but merging them failed: {outcome.fault}. "
+            "Run the command again: finished clusters are kept."
+        )
+    note = folder / "merge.json"
+    told = json.loads(note.read_text(encoding="utf-8"))
+    note.unlink()
+    report.members = told["members"]
+    report.refused = [(name, reason) for name, reason in told["refused"]]
+    report.joined_later = told["joined_later"]
+
+
+def merge_models(
+    advance: Callable[[int], None],
+    database: Path,
+    images: Path | None,
+    models: Sequence[Path],
+    folder: Path,
+    options: MappingOptions,
+) -> None:
+    """Merge models of clusters, adjust, and write `folder`/0, 1, ... (in a worker).
+
+    A model of which the larger ones have nearly all images (fewer than `min_model_size` are its
+    own) is left out. What happened is written to `folder`/merge.json.
+    """
+    sub_models = [
+        read_sub_model(f"{path.parent.name}/{path.name}", pycolmap.Reconstruction(path))
+        for path in models
+    ]
+    merged = merge(sub_models, options.seed)
+    cache = load_cache(database)
+    pipeline = pipeline_options(options, colors=False)
+    have: set[int] = set()
+    members: list[list[str]] = []
+    refused: list[tuple[str, str]] = []
+    joined_later = 0
+    for group in sorted(merged, key=lambda group: -len(group.model.poses)):
+        refused += group.refused
+        if len(group.model.poses.keys() - have) < options.min_model_size:
+            continue
+        reconstruction = rebuild(group.model, cache)
+        refine(reconstruction, cache, pipeline, lambda: advance(1))
+        registered = set(reconstruction.reg_image_ids())
+        if len(registered - have) < options.min_model_size:
+            continue
+        joined_later += len(registered - group.model.poses.keys())
+        have |= registered
+        if images is not None:
+            reconstruction.extract_colors_for_all_images(images)
+        target = folder / str(len(members))
+        target.mkdir()
+        reconstruction.write(target)
+        members.append(group.members)
+        advance(len(group.model.poses))
+    told = {"members": members, "refused": refused, "joined_later": joined_later}
+    (folder / "merge.json").write_text(json.dumps(told), encoding="utf-8")
+
+
+def worker_count(database: Path, largest: int, jobs: int, options: MappingOptions) -> int:
+    """Return how many clusters are mapped at once within the processors and the memory.
+
+    Args:
+        largest: images of the largest cluster; its memory is estimated from its share of the
+            database.
+    """
+    processors = options.threads or usable_processors()
+    memory = options.memory or MEMORY_SHARE * _machine_bytes()
+    share = largest / max(1, _image_count(database))
+    one = WORKER_BYTES + BYTES_PER_DATABASE_BYTE * share * database.stat().st_size
+    return max(1, min(processors, jobs, math.floor(memory / one)))
+
+
+def _image_count(database: Path) -> int:
+    from colmap_netvlad.database import open_database
+
+    with open_database(database) as opened:
+        return len(opened.images())
+
+
+def _machine_bytes() -> float:
+    try:
+        return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+    except (AttributeError, ValueError, OSError):
+        return 8 * 2.0**30
+
+
+def _numbered(folder: Path) -> list[Path]:
+    return sorted(
+        (path for path in folder.iterdir() if path.name.isdigit()), key=lambda path: int(path.name)
+    )
+
+
+def _registered(model: Path) -> int:
+    return int(pycolmap.Reconstruction(model).num_reg_images())

@@ -1,0 +1,119 @@
+"""COLMAP's hierarchical and global mapping, and the automatic choice of a mapper."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import pycolmap
+
+from colmap_netvlad import progress
+from colmap_netvlad.database import open_database
+from colmap_netvlad.errors import InputError
+from colmap_netvlad.mapping import workers
+from colmap_netvlad.mapping.incremental import map_incremental, pipeline_options
+from colmap_netvlad.mapping.options import MappingOptions
+from colmap_netvlad.mapping.output import model_folder
+from colmap_netvlad.mapping.parallel import CLUSTER_IMAGES, map_parallel
+
+PARALLEL_IMAGES = 500
+"""From this many images with features on, parallel mapping is chosen (measured, see
+docs/parallel-sfm.md)."""
+
+OVERLAP_SHARE = 0.1
+"""Images that COLMAP's neighbouring clusters share, of a cluster: its default, 50 of 500."""
+
+
+def map_automatic(
+    database: Path,
+    images: Path | None,
+    output: Path,
+    options: MappingOptions = MappingOptions(),
+) -> list[pycolmap.Reconstruction]:
+    """Map incrementally below `PARALLEL_IMAGES` images, in parallel from there on."""
+    with open_database(database) as opened:
+        count = len(opened.keypoint_counts())
+    mapper = map_parallel if count >= PARALLEL_IMAGES else map_incremental
+    return mapper(database, images, output, options)
+
+
+def map_hierarchical(
+    database: Path,
+    images: Path | None,
+    output: Path,
+    options: MappingOptions = MappingOptions(),
+) -> list[pycolmap.Reconstruction]:
+    """Reconstruct with COLMAP's hierarchical mapper (see `incremental.map_incremental`)."""
+    return _map("hierarchically", run_hierarchical, database, images, output, options)
+
+
+def map_global(
+    database: Path,
+    images: Path | None,
+    output: Path,
+    options: MappingOptions = MappingOptions(),
+) -> list[pycolmap.Reconstruction]:
+    """Reconstruct with COLMAP's global mapper, GLOMAP (see `incremental.map_incremental`)."""
+    return _map("globally", run_global, database, images, output, options)
+
+
+def run_hierarchical(
+    advance: Callable[[int], None],
+    database: Path,
+    images: Path | None,
+    folder: Path,
+    options: MappingOptions,
+) -> None:
+    """Run COLMAP's hierarchical mapper (in a worker) and write models `folder`/0, 1, ..."""
+    size = options.cluster_size or CLUSTER_IMAGES
+    pipeline = pycolmap.HierarchicalPipelineOptions()
+    pipeline.incremental_options = pipeline_options(options, colors=images is not None)
+    pipeline.clustering_options.leaf_max_num_images = size
+    pipeline.clustering_options.image_overlap = max(3, math.ceil(OVERLAP_SHARE * size))
+    pipeline.num_threads = options.threads or -1
+    models = pycolmap.hierarchical_mapping(database, images or folder, folder, options=pipeline)
+    _write(models, folder)
+
+
+def run_global(
+    advance: Callable[[int], None],
+    database: Path,
+    images: Path | None,
+    folder: Path,
+    options: MappingOptions,
+) -> None:
+    """Run COLMAP's global mapper (in a worker) and write models `folder`/0, 1, ..."""
+    pipeline = pycolmap.GlobalPipelineOptions()
+    pipeline.random_seed = options.seed
+    pipeline.min_model_size = options.min_model_size
+    pipeline.num_threads = options.threads or -1
+    models = pycolmap.global_mapping(database, images or folder, folder, options=pipeline)
+    _write(models, folder)
+
+
+def _map(
+    how: str,
+    function: Callable[..., None],
+    database: Path,
+    images: Path | None,
+    output: Path,
+    options: MappingOptions,
+) -> list[pycolmap.Reconstruction]:
+    """Run a mapper that cannot be cancelled in a worker, which Ctrl-C ends."""
+    with model_folder(output) as folder:
+        with progress.step(f"Mapping {how}", 0) as bar:
+            job = workers.Job(function, (database, images, folder, options))
+            (outcome,) = workers.run([job], 1, bar.advance)
+        if outcome.fault is not None:
+            raise InputError(f"COLMAP could not map {how}: {outcome.fault}.")
+        return [pycolmap.Reconstruction(path) for path in sorted(folder.iterdir()) if path.is_dir()]
+
+
+def _write(models: dict[int, pycolmap.Reconstruction], folder: Path) -> None:
+    """Write the models that COLMAP has not written itself."""
+    for index, model in models.items():
+        target = folder / str(index)
+        if not target.exists():
+            target.mkdir()
+            model.write(target)

@@ -1,0 +1,104 @@
+"""From merged sub-models to a COLMAP model: adjusted together, missed images registered."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from colmap_netvlad.mapping.merge import SubModel
+
+MIN_NUM_MATCHES = 15
+"""Verified matches a pair needs to be used: the default of COLMAP's mappers."""
+
+SEAM_ITERATIONS = 20
+"""Iterations of the first bundle adjustment, which need not converge."""
+
+MAX_REFINEMENTS = 3
+"""Rounds of bundle adjustment and filtering of the merged model; they stop when little changes."""
+
+
+def load_cache(database: Path) -> pycolmap.DatabaseCache:
+    """Load what mapping needs of a whole database."""
+    opened = pycolmap.Database.open(database)
+    try:
+        options = pycolmap.DatabaseCacheOptions(min_num_matches=MIN_NUM_MATCHES)
+        return pycolmap.DatabaseCache.create(opened, options)
+    finally:
+        opened.close()
+
+
+def rebuild(model: SubModel, cache: pycolmap.DatabaseCache) -> pycolmap.Reconstruction:
+    """Turn arrays into a reconstruction over the images of a database.
+
+    Each camera of the database is one camera of the model, whatever sub-models it was in.
+    """
+    reconstruction = pycolmap.Reconstruction()
+    reconstruction.load(cache)
+    for camera_id, (params, _) in model.cameras.items():
+        reconstruction.camera(camera_id).params = params.tolist()
+    for rig_id, rig in model.rigs.items():
+        if reconstruction.exists_rig(rig_id):
+            for sensor, pose in rig.non_ref_sensors.items():
+                if pose is not None:
+                    reconstruction.rig(rig_id).set_sensor_from_rig(sensor, pose)
+    for image_id in sorted(model.poses):
+        image = reconstruction.image(image_id)
+        frame = reconstruction.frame(image.frame_id)
+        if not frame.has_pose():
+            frame.set_cam_from_world(image.camera_id, model.poses[image_id])
+            reconstruction.register_frame(image.frame_id)
+    order = np.argsort(model.owner, kind="stable")
+    ends = np.cumsum(np.bincount(model.owner, minlength=len(model.xyz)))
+    keys = model.keys[order]
+    images, keypoints = (keys >> 32).tolist(), (keys & 0xFFFFFFFF).tolist()
+    start = 0
+    for xyz, color, end in zip(model.xyz, model.color, ends.tolist(), strict=True):
+        elements = [
+            pycolmap.TrackElement(image, keypoint)
+            for image, keypoint in zip(images[start:end], keypoints[start:end], strict=True)
+        ]
+        reconstruction.add_point3D(xyz, pycolmap.Track(elements), color)
+        start = end
+    return reconstruction
+
+
+def refine(
+    reconstruction: pycolmap.Reconstruction,
+    cache: pycolmap.DatabaseCache,
+    options: pycolmap.IncrementalPipelineOptions,
+    registered: Callable[[], None],
+) -> None:
+    """Adjust a merged model and register the images it misses, in place.
+
+    A first bundle adjustment with a robust loss takes up the seams between sub-models before
+    anything is filtered; tracks are then completed and merged across them.
+
+    Args:
+        registered: called for each image registered.
+    """
+    mapper = pycolmap.IncrementalMapper(cache)
+    mapper.begin_reconstruction(reconstruction)
+    robust = options.get_global_bundle_adjustment()
+    robust.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    robust.ceres.solver_options.max_num_iterations = SEAM_ITERATIONS
+    mapper.adjust_global_bundle(options.get_mapper(), robust)
+    mapper.iterative_global_refinement(
+        MAX_REFINEMENTS,
+        options.ba_global_max_refinement_change,
+        options.get_mapper(),
+        options.get_global_bundle_adjustment(),
+        options.get_triangulation(),
+    )
+    mapper.filter_frames(options.get_mapper())
+    mapper.end_reconstruction(False)
+    if reconstruction.num_reg_images() < cache.num_images():
+        # COLMAP's own loop: register, triangulate, adjust locally, adjust globally in the end.
+        pipeline = pycolmap.IncrementalPipeline(options, cache, pycolmap.ReconstructionManager())
+        next_image = pycolmap.IncrementalPipelineCallback.NEXT_IMAGE_REG_CALLBACK
+        pipeline.add_callback(next_image.value, registered)
+        pipeline.reconstruct_sub_model(mapper, options.get_mapper(), reconstruction)
+        mapper.end_reconstruction(False)
+    reconstruction.update_point_3d_errors()
