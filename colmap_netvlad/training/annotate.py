@@ -13,9 +13,9 @@ from scipy import sparse
 
 from colmap_netvlad.database import copy_database, open_database
 from colmap_netvlad.errors import InputError
+from colmap_netvlad.images import PHOTO_SUFFIXES, find_photos, photo_fingerprint
 from colmap_netvlad.training.scenes import (
     ANNOTATION,
-    PHOTO_SUFFIXES,
     Scene,
     check_disjoint,
     load_annotation,
@@ -137,7 +137,7 @@ def annotate_scene(folder: SceneFolder, options: AnnotateOptions) -> Scene:
     """
     target = (options.output / folder.name) if options.output else folder.folder
     path = target / ANNOTATION
-    photos = list_photos(folder.images)
+    photos = find_photos(folder.images)
     if path.exists():
         scene = load_annotation(path)
         if set(scene.names) == set(photos):
@@ -163,8 +163,6 @@ def scene_of(
     Raises:
         InputError: fewer than `MIN_REGISTERED` images are registered.
     """
-    from colmap_netvlad.images import photo_fingerprint
-
     with open_database(database) as opened:
         rows = opened.images()
         verified = opened.verified_matches()
@@ -205,22 +203,15 @@ def scene_of(
     )
 
 
-def list_photos(folder: Path) -> list[str]:
-    """List the photos below a folder, relative to it with forward slashes, sorted."""
-    return sorted(
-        path.relative_to(folder).as_posix()
-        for path in folder.rglob("*")
-        if path.suffix.lower() in PHOTO_SUFFIXES and path.is_file()
-    )
-
-
 def _scene_in(folder: Path) -> SceneFolder | None:
     for images in (folder / "images", folder):
-        if images.is_dir() and any(
-            path.suffix.lower() in PHOTO_SUFFIXES for path in images.iterdir()
-        ):
+        if images.is_dir() and any(_is_photo(path) for path in images.iterdir()):
             return SceneFolder(folder.resolve().name, images, folder)
     return None
+
+
+def _is_photo(path: Path) -> bool:
+    return path.suffix.lower() in PHOTO_SUFFIXES and not path.name.startswith(".")
 
 
 def _matched_database(folder: SceneFolder, database: Path, options: AnnotateOptions) -> str:
@@ -286,5 +277,3 @@ def _fill_poses(
         pose = image.cam_from_world()
         x, y, z, w = pose.rotation.quat
         poses[row] = [w, x, y, z, *pose.translation]
-
-

@@ -60,12 +60,6 @@ class View:
     colour: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
 
-def whole_view(photo: Size, size: Size) -> View:
-    """Return the view that shows the whole photo, stretched to `size` where it has to be."""
-    wide, high = _extent(size) / _extent(photo)
-    return View(np.diag([wide, high, 1.0]))
-
-
 def draw_view(
     rng: np.random.Generator, photo: Size, size: Size, augmentation: Augmentation
 ) -> View:

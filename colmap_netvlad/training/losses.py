@@ -96,6 +96,19 @@ LOSSES: dict[str, Loss] = {
 """The losses by the name that `train --loss` takes."""
 
 
+def keep_similarities(descriptors: Tensor, similarities: Tensor) -> Tensor:
+    """Distillation: mean squared difference of cosine similarities over pairs of different photos.
+
+    It compares similarities, not descriptors, so that teacher and pupil may differ in length.
+
+    Args:
+        descriptors: (N, D) of the network, L2-normalised.
+        similarities: (N, N) of the teacher.
+    """
+    different = ~torch.eye(len(descriptors), dtype=torch.bool, device=descriptors.device)
+    return (descriptors @ descriptors.T - similarities)[different].square().mean()
+
+
 def _distances(descriptors: Tensor, query: Query) -> tuple[Tensor, Tensor]:
     """Return the distances D of the anchor to its positives (P,) and negatives (Q,)."""
     others = descriptors[[*query.positives, *query.negatives]]

@@ -35,7 +35,6 @@ from colmap_netvlad.metrics import CORRECT_MATCHES, Pair, as_pair
 FORMAT = "colmap-netvlad annotation"
 VERSION = 1
 ANNOTATION = "annotation.json"
-PHOTO_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"})
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,195 @@
+"""Every setting of a training run, in one table: the command line and recipe files are made of it.
+
+The defaults are the paper's recipe (section 4.2). A recipe is a TOML file with these names:
+
+    trunk = "vgg16"
+    loss = "ranked-list"
+    learning_rate = 1e-5
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any
+
+from colmap_netvlad.errors import InputError
+from colmap_netvlad.training.augment import Augmentation, PseudoOptions
+from colmap_netvlad.training.losses import LOSSES, LossOptions
+from colmap_netvlad.training.sampling import MINING, SamplingOptions
+
+ALPHA = {"netvlad": 1.35, "gem": 0.9, "max": 0.9}
+"""Margin alpha of eq. 11 by aggregation (section 4.3.2)."""
+
+
+def setting(default: Any, help: str, **more: Any) -> Any:
+    """Make a field with the text of `train --help`; `more` may hold `choices` or `type`."""
+    return field(default=default, metadata={"help": help, **more})
+
+
+@dataclass(frozen=True)
+class TrainOptions:
+    """The settings of a training run; what each means stands beside it."""
+
+    # The network.
+    trunk: str = setting("vgg16", "Trunk: a name of the table of backbones.")
+    weights: str | None = setting(
+        None, "ImageNet weights of the trunk, a file.  [default: downloaded]", type=str
+    )
+    aggregation: str = setting("netvlad", "Aggregation layer.", choices=tuple(ALPHA))
+    clusters: int = setting(64, "Centres of NetVLAD.")
+    start: str | None = setting(
+        None, "Checkpoint to start from, instead of trunk, weights and aggregation.", type=str
+    )
+    frozen: str | None = setting(
+        None, "Last stage of the trunk that stays as it is (conv5_2, block7, layer3).", type=str
+    )
+
+    # The photos.
+    width: int = setting(480, "Width of a training view, px.")
+    height: int = setting(320, "Height of a training view, px.")
+    views: int = setting(
+        0, "Views of each photo whose frozen features are kept on disk; 0: new ones each time."
+    )
+    rotation: float = setting(180.0, "Largest turn of a view, degrees.")
+    flip: float = setting(0.5, "Probability of a mirrored view.")
+    scale_min: float = setting(0.65, "Smallest share of a photo's longer side in a view.")
+    scale_max: float = setting(1.25, "Largest share of a photo's longer side in a view.")
+    perspective: float = setting(0.08, "Largest shift of a view's corner, share of its side.")
+    illumination: float = setting(0.2, "Strength of changes of illumination.")
+    pseudo_views: int = setting(
+        0, "Cut this many views from each photo as a pseudo-scene of known overlap; 0: none."
+    )
+    pseudo_share: float = setting(0.3, "Share of anchors from pseudo-scenes, where there are any.")
+
+    # The batches.
+    mining: str = setting("nontrivial", "Sample mining: eq. 8, or eq. 7.", choices=MINING)
+    scenes_per_batch: int = setting(5, "B, the anchors of a batch, each of another scene.")
+    positives: int = setting(3, "M, the positives of an anchor.")
+    epsilon: int = setting(15, "A positive shares more 3D points than this with its anchor.")
+    hard_negatives: int = setting(2, "Negatives of an anchor in global mining.")
+    same_flight: int = setting(0, "Further negatives of the anchor's flight, surely apart.")
+
+    # The loss.
+    loss: str = setting("ranked-list", "Loss.", choices=tuple(LOSSES))
+    margin: float = setting(0.1, "m, between positive and negative (eq. 9 and 11).")
+    alpha: float | None = setting(
+        None, "Radius of eq. 11.  [default: 1.35 for netvlad, else 0.9]", type=float
+    )
+    contrastive_margin: float = setting(0.7, "Distance at which a negative costs nothing.")
+    nontrivial: bool = setting(True, "Leave samples of zero loss out of the average.")
+    teacher: str | None = setting(
+        None,
+        "Checkpoint whose similarities the network is to keep; `start` is its own beginning.",
+        type=str,
+    )
+    teacher_weight: float = setting(1.0, "Weight of keeping the teacher's similarities.")
+
+    # The optimisation.
+    epochs: int = setting(20, "Epochs.")
+    iterations: int = setting(2000, "Batches of an epoch.")
+    learning_rate: float = setting(1e-5, "Learning rate l_0 of Adam.")
+    decay: float = setting(0.1, "The learning rate of epoch i is l_0 exp(-decay i).")
+    head_rate: float = setting(1.0, "Factor on the learning rate of the aggregation layer.")
+    momentum: float = setting(0.9, "Adam's first beta.")
+    weight_decay: float = setting(5e-4, "Weight decay.")
+    seed: int = setting(0, "Seed of every random choice.")
+
+    # The model that comes out, and its measure.
+    long_side: int = setting(480, "Longer side of a photo when it is described later, px.")
+    rotations: int = setting(4, "Quarter turns a descriptor is averaged over later.")
+    validate_every: int = setting(1, "Epochs between validations.")
+    checkpoint_every: int = setting(500, "Batches between checkpoints, beside each epoch's.")
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            choices = item.metadata.get("choices")
+            value = getattr(self, item.name)
+            if choices and value not in choices:
+                raise InputError(f"{item.name} is {value!r}; it is one of {', '.join(choices)}.")
+        positive = (
+            "clusters width height scenes_per_batch positives epochs iterations validate_every "
+            "checkpoint_every long_side learning_rate scale_min"
+        )
+        for name in positive.split():
+            if getattr(self, name) <= 0:
+                raise InputError(f"{name} is {getattr(self, name)}; it must be more than 0.")
+        if self.scale_max < self.scale_min:
+            raise InputError(f"scale_max {self.scale_max} is below scale_min {self.scale_min}.")
+        if self.rotations not in (1, 4):
+            raise InputError(f"rotations is {self.rotations}; it is 1 or 4.")
+        if self.views and self.frozen is None:
+            raise InputError(
+                "views keeps frozen features on disk: say with frozen up to where the trunk stays."
+            )
+
+    def for_losses(self) -> LossOptions:
+        """The margins of the losses."""
+        alpha = ALPHA[self.aggregation] if self.alpha is None else self.alpha
+        return LossOptions(self.margin, alpha, self.contrastive_margin, self.nontrivial)
+
+    def for_sampling(self) -> SamplingOptions:
+        """How batches are drawn."""
+        return SamplingOptions(
+            mining=self.mining,
+            scenes=self.scenes_per_batch,
+            positives=self.positives,
+            epsilon=self.epsilon,
+            hard_negatives=self.hard_negatives,
+            same_flight=self.same_flight,
+            pseudo_share=self.pseudo_share if self.pseudo_views else 0.0,
+            seed=self.seed,
+        )
+
+    def for_views(self) -> Augmentation:
+        """How views differ from their photos."""
+        return Augmentation(
+            rotation=self.rotation,
+            flip=self.flip,
+            scale=(self.scale_min, self.scale_max),
+            perspective=self.perspective,
+            illumination=self.illumination,
+        )
+
+    def for_pseudo_scenes(self) -> PseudoOptions:
+        """How pseudo-scenes are cut."""
+        return PseudoOptions(views=self.pseudo_views, seed=self.seed)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain data for checkpoints and records."""
+        return asdict(self)
+
+
+def read_recipe(path: Path) -> dict[str, Any]:
+    """Read the settings of a recipe file.
+
+    Raises:
+        InputError: it is missing, not TOML, or has a name or a kind of value that
+            `TrainOptions` does not know.
+    """
+    if not path.is_file():
+        raise InputError(f"The recipe {path} does not exist.")
+    try:
+        record = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as fault:
+        raise InputError(f"The recipe {path} is not TOML: {fault}.") from fault
+    known = {item.name: item for item in fields(TrainOptions)}
+    for name, value in record.items():
+        if name not in known:
+            raise InputError(
+                f"The recipe {path} has {name}, which is no setting of `train`; "
+                "`colmap-netvlad train --help` lists them."
+            )
+        kind = known[name].metadata.get("type", type(known[name].default))
+        if kind is float and isinstance(value, int) and not isinstance(value, bool):
+            record[name] = value = float(value)
+        if type(value) is not kind:
+            raise InputError(f"In the recipe {path}, {name} must be a {kind.__name__}.")
+    return record
+
+
+def with_settings(options: TrainOptions, settings: Mapping[str, Any]) -> TrainOptions:
+    """Return options with some settings changed."""
+    return replace(options, **settings)
