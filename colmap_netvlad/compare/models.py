@@ -1,0 +1,135 @@
+"""One method's pairs -> a database of its own -> its model, its figures, its plan."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import sqlite3
+import time
+from collections.abc import Collection
+from contextlib import closing
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+
+from colmap_netvlad.compare.evidence import Plan
+from colmap_netvlad.compare.result import ModelFigures
+from colmap_netvlad.database import open_database, pair_id
+from colmap_netvlad.files import atomic_path, write_atomically
+from colmap_netvlad.mapping.incremental import map_incremental
+from colmap_netvlad.mapping.options import MappingOptions
+from colmap_netvlad.mapping.summary import summarize
+from colmap_netvlad.metrics import Pair
+
+MATCH_TABLES = ("matches", "two_view_geometries")
+
+PLAN_POINTS = 20_000
+"""Points of a model kept for its plan: more cannot be told apart in a figure of a page."""
+
+
+def reconstruct_once(
+    union: Path,
+    images: Path | None,
+    folder: Path,
+    pairs: Collection[Pair],
+    k: int,
+    options: MappingOptions,
+) -> ModelFigures:
+    """Map from the method's own pairs alone, or return the figures of an earlier, equal run.
+
+    Args:
+        union: the database in which all methods' pairs are matched.
+        images: the photos, for the colours of points; None leaves them black.
+        folder: gets `sparse/0`, ..., `figures.json` and `plan.npz`.
+        pairs: the method's pairs.
+        k: partners an image they come from, for the figures.
+    """
+    done, digest = folder / "figures.json", _digest(union, pairs, k, options)
+    if done.is_file():
+        kept = json.loads(done.read_text(encoding="utf-8"))
+        if kept.pop("digest", None) == digest:
+            return ModelFigures(**kept)
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    database = folder / "database.db"
+    copy_pairs(union, database, pairs)
+    start = time.perf_counter()
+    models = map_incremental(database, images, folder / "sparse", options)
+    seconds = time.perf_counter() - start
+    database.unlink()
+    figures = ModelFigures(k, seconds=seconds)
+    if models:
+        largest = max(models, key=lambda model: (model.num_reg_images(), model.num_points3D()))
+        summary = summarize(largest)
+        figures = ModelFigures(
+            k,
+            models=len(models),
+            registered=summary.registered,
+            points=summary.points,
+            observations=summary.observations,
+            mean_reprojection_error=summary.mean_reprojection_error if summary.points else None,
+            mean_track_length=summary.mean_track_length if summary.points else None,
+            seconds=seconds,
+        )
+        _save_plan(folder / "plan.npz", largest)
+    write_atomically(done, json.dumps({**asdict(figures), "digest": digest}, indent=1))
+    return figures
+
+
+def read_plan(folder: Path) -> Plan | None:
+    """Return the plan of the model in a method's folder, or None where there is none."""
+    path = folder / "plan.npz"
+    if not path.is_file():
+        return None
+    with np.load(path, allow_pickle=False) as kept:
+        names = tuple(kept["names"].tolist())
+        return Plan(names, kept["centres"], kept["points"], kept["colours"])
+
+
+def copy_pairs(union: Path, target: Path, pairs: Collection[Pair]) -> None:
+    """Copy a database with the matches of these pairs only.
+
+    Local descriptors are left out: mapping does not read them, and they are most of the file.
+    """
+    with open_database(union) as opened:
+        ids = {row.name: row.image_id for row in opened.images()}
+    wanted = [(pair_id(ids[a], ids[b]),) for a, b in sorted(pairs)]
+    with atomic_path(target) as temporary, closing(sqlite3.connect(temporary)) as copy:
+        copy.execute("ATTACH ? AS whole", (str(union),))
+        schema = copy.execute(
+            "SELECT type, name, sql FROM whole.sqlite_master"
+            " WHERE sql IS NOT NULL AND name NOT LIKE 'sqlite_%' ORDER BY type = 'table' DESC"
+        ).fetchall()
+        copy.execute("CREATE TEMP TABLE wanted (pair_id INTEGER PRIMARY KEY)")
+        copy.executemany("INSERT INTO wanted VALUES (?)", wanted)
+        for kind, table, statement in schema:
+            copy.execute(statement)
+            if kind != "table" or table == "descriptors":
+                continue
+            own = " WHERE pair_id IN (SELECT pair_id FROM wanted)" if table in MATCH_TABLES else ""
+            copy.execute(f'INSERT INTO main."{table}" SELECT * FROM whole."{table}"{own}')
+        version = copy.execute("PRAGMA whole.user_version").fetchone()[0]
+        copy.execute(f"PRAGMA main.user_version = {version}")
+        copy.commit()
+
+
+def _save_plan(path: Path, model: object) -> None:
+    registered = [image for image in model.images.values() if image.has_pose]  # type: ignore[attr-defined]
+    registered.sort(key=lambda image: image.name)
+    points = [point for _, point in sorted(model.points3D.items())]  # type: ignore[attr-defined]
+    points = points[:: max(1, -(-len(points) // PLAN_POINTS))]
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(
+            file,
+            names=np.array([image.name for image in registered], dtype=np.str_),
+            centres=np.array([image.projection_center() for image in registered]).reshape(-1, 3),
+            points=np.array([point.xyz for point in points]).reshape(-1, 3),
+            colours=np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3),
+        )
+
+
+def _digest(union: Path, pairs: Collection[Pair], k: int, options: MappingOptions) -> str:
+    text = "\n".join([f"{union.name} {k} {options!r}", *(f"{a}\t{b}" for a, b in sorted(pairs))])
+    return hashlib.sha256(text.encode("utf-8")).hexdigest()

@@ -1,0 +1,1 @@
+"""What the user reads: tables, plots, the page of a comparison."""

@@ -1,0 +1,115 @@
+"""A comparison in the terminal and as CSV."""
+
+from __future__ import annotations
+
+import csv
+import io
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from colmap_netvlad.compare.result import EXHAUSTIVE, Comparison, MethodResult
+from colmap_netvlad.files import write_atomically
+from colmap_netvlad.report.measures import MEASURES, shown
+
+BEST = "*"
+"""Marks the best of a row."""
+
+RETRIEVAL_COLUMNS = (
+    "pairs", "correct", "accuracy", "recall", "components", "largest_component",
+)  # fmt: skip
+
+
+def summary_table(comparison: Comparison) -> Table:
+    """Return the summary: a row for each measure, a column for each method."""
+    table = Table(
+        title=f"{comparison.project}: {comparison.images:,} images, k = {comparison.k}",
+        title_justify="left",
+        caption=f"{BEST} best of the row. {reference_sentence(comparison)}",
+        caption_justify="left",
+    )
+    table.add_column("")
+    for method in comparison.methods:
+        table.add_column(method.name, justify="right", overflow="fold")
+    group = ""
+    for measure in shown(comparison):
+        if measure.group != group and group:
+            table.add_section()
+        group = measure.group
+        best = measure.best(comparison.methods)
+        texts = {method.name: measure.show(method) for method in comparison.methods}
+        cells = [f"[bold]{BEST}{t}[/]" if name in best else t for name, t in texts.items()]
+        table.add_row(measure.title, *cells)
+    return table
+
+
+def print_comparison(comparison: Comparison, console: Console | None = None) -> None:
+    """Print the summary on standard output, whole also where the terminal is narrow."""
+    console = console or Console()
+    table = summary_table(comparison)
+    needed = console.measure(table).maximum
+    if needed > console.width:
+        console = Console(file=console.file, width=needed, force_terminal=console.is_terminal)
+    console.print(table)
+
+
+def reference_sentence(comparison: Comparison) -> str:
+    """Say what recall and average precision are measured against."""
+    pairs = f"{comparison.reference_pairs:,} pairs with more than 15 verified matches"
+    if comparison.reference == EXHAUSTIVE:
+        return f"Recall and average precision are against all {pairs} of exhaustive matching."
+    return (
+        f"Recall and average precision are against the union of the methods' own {pairs}: "
+        "without exhaustive matching nobody knows the others, so they are upper bounds."
+    )
+
+
+def write_csv(path: Path, comparison: Comparison) -> None:
+    """Write a row for each method and k; times and the model stand in the rows they belong to.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    rest = [m for m in MEASURES if m.key not in RETRIEVAL_COLUMNS]
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(["method", "k", *RETRIEVAL_COLUMNS, *(m.key for m in rest), "failed"])
+    for method in comparison.methods:
+        failed = method.failed or (method.model.failed if method.model else None) or ""
+        blank = [""] * len(rest)
+        if not method.at_k:
+            writer.writerow([method.name, "", *[""] * len(RETRIEVAL_COLUMNS), *blank, failed])
+        for figures in method.at_k:
+            row = [_cell(getattr(figures, column)) for column in RETRIEVAL_COLUMNS]
+            last = figures is method.best_k
+            figures_of_method = [_cell(m.value(method)) for m in rest] if last else blank
+            writer.writerow(
+                [method.name, figures.k, *row, *figures_of_method, failed if last else ""]
+            )
+    write_atomically(path, out.getvalue())
+
+
+def notes_of(method: MethodResult) -> list[str]:
+    """Return what has to be said about a method's figures."""
+    notes = list(method.notes)
+    if method.timed_earlier:
+        notes.append("Its descriptors were reused; the time of describing is the earlier run's.")
+    if method.match_measured < 1:
+        notes.append(
+            f"Matching was timed on {100 * method.match_measured:.0f} % of its pairs and "
+            "scaled to all of them."
+        )
+    if method.failed:
+        notes.append(f"Not compared: {method.failed}")
+    if method.model and method.model.failed:
+        notes.append(f"Mapping failed: {method.model.failed}")
+    if method.model and not method.model.failed and not method.model.registered:
+        notes.append("Mapping ended without a model: no image could be registered.")
+    return notes
+
+
+def _cell(value: float | None) -> str:
+    if value is None:
+        return ""
+    return str(value) if isinstance(value, int) else f"{value:.6g}"

@@ -1,0 +1,177 @@
+"""Where images stand on the ground plan: the one frame in which all view graphs are drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import networkx as nx
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from colmap_netvlad.compare.evidence import Evidence, Plan
+from colmap_netvlad.metrics import Pair
+
+LEAST_SPREAD = 0.02
+"""Points on a line to within this share of its length do not fix a rotation."""
+
+Points = NDArray[np.float64]
+
+NOWHERE = np.full(3, np.nan)
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """Images on the ground plan.
+
+    Attributes:
+        names: N image names.
+        xyz: (N, 3) positions seen from above (x right, y up, z towards the viewer); NaN where an
+            image could not be placed.
+        source: a phrase of where the positions come from.
+        metric: whether the unit is the metre and up is north.
+        estimated: images placed at the middle of their verified partners.
+    """
+
+    names: tuple[str, ...]
+    xyz: Points
+    source: str
+    metric: bool
+    estimated: tuple[str, ...] = ()
+
+    @property
+    def placed(self) -> NDArray[np.bool_]:
+        """(N) whether an image has a position."""
+        return np.asarray(np.isfinite(self.xyz).all(axis=1))
+
+
+def lay_out(evidence: Evidence) -> Layout:
+    """Place the images by the largest model of all methods, else by GPS, else by the view graph.
+
+    A model is turned so that the ground lies in the plane of the page; where GPS
+    positions are known it is moved onto them, so that north is up and the unit is the metre.
+    """
+    known = dict(_finite(evidence.names, evidence.positions))
+    best = max(evidence.plans.items(), key=lambda item: len(item[1].names), default=None)
+    if best is not None and len(best[1].names) >= 3:
+        method, plan = best
+        target = np.array([known.get(name, NOWHERE) for name in plan.names])
+        onto_positions = similarity(plan.centres, target)
+        move = onto_positions or from_above(plan)
+        placed, metric = dict(zip(plan.names, move(plan.centres), strict=True)), False
+        source = f"camera positions of the model of {method}, seen from above"
+        if onto_positions:
+            placed, metric = {**known, **placed}, True
+            source = f"camera positions of the model of {method}, moved onto the GPS positions"
+    elif len(known) >= 3:
+        placed, metric, source = known, True, "GPS positions or priors"
+    else:
+        placed, metric = spectral_positions(evidence.names, evidence.truth), False
+        source = "the view graph alone (spectral layout): near means many common partners"
+    placed, estimated = _between_partners(evidence, placed)
+    xyz = np.full((len(evidence.names), 3), np.nan)
+    for i, name in enumerate(evidence.names):
+        if name in placed:
+            xyz[i] = placed[name]
+    return Layout(evidence.names, xyz, source, metric, estimated)
+
+
+def align(plan: Plan, layout: Layout) -> Plan:
+    """Return a model moved into the layout's frame, or seen from above where they share too few
+    images to tell how."""
+    index = {name: i for i, name in enumerate(layout.names)}
+    target = np.array([layout.xyz[index[name]] for name in plan.names]).reshape(-1, 3)
+    move = similarity(plan.centres, target)
+    if move is None:
+        move = from_above(plan)
+    return Plan(plan.names, move(plan.centres), move(plan.points), plan.colours)
+
+
+class Move:
+    """A similarity transform of 3D points: scale, rotation, translation."""
+
+    def __init__(self, scale: float, rotation: NDArray[np.float64], origin: Points, target: Points):
+        self._linear = scale * rotation
+        self._origin, self._target = origin, target
+
+    def __call__(self, points: Points) -> Points:
+        return (points - self._origin) @ self._linear.T + self._target
+
+
+def similarity(source: Points, target: Points) -> Move | None:
+    """Return the least-squares similarity from (N, 3) onto (N, 3), or None where it is not fixed:
+    fewer than three common finite points, or points on a line."""
+    both = np.isfinite(source).all(axis=1) & np.isfinite(target).all(axis=1)
+    source, target = source[both], target[both]
+    if len(source) < 3:
+        return None
+    origin, middle = source.mean(axis=0), target.mean(axis=0)
+    a, b = source - origin, target - middle
+    for spread in (np.linalg.svd(a, compute_uv=False), np.linalg.svd(b, compute_uv=False)):
+        if spread[1] <= LEAST_SPREAD * spread[0]:
+            return None
+    rotation, _ = Rotation.align_vectors(b, a)
+    matrix = rotation.as_matrix()
+    scale = float((b * (a @ matrix.T)).sum() / (a**2).sum())
+    return Move(scale, matrix, origin, middle) if scale > 0 else None
+
+
+def from_above(plan: Plan) -> Move:
+    """Return the rotation that lays the ground into the page, cameras above it.
+
+    The ground's normal is the direction in which points and cameras spread least: a drone's
+    flight is wide and flat.
+    """
+    cloud = np.vstack([plan.centres, _core(plan.points)])
+    middle = cloud.mean(axis=0)
+    axes = np.linalg.svd(cloud - middle, full_matrices=True)[2]
+    up, right = axes[2], axes[0]
+    above = plan.centres.mean(axis=0) - (
+        np.median(plan.points, axis=0) if len(plan.points) else middle
+    )
+    if above @ up < 0:
+        up = -up
+    return Move(1.0, np.array([right, np.cross(up, right), up]), middle, np.zeros(3))
+
+
+def spectral_positions(names: tuple[str, ...], pairs: Collection[Pair]) -> dict[str, Points]:
+    """Place the images of the view graph's largest component by its spectral layout."""
+    graph = nx.Graph()
+    graph.add_nodes_from(names)
+    graph.add_edges_from(sorted(pairs))
+    largest: set[str] = max(nx.connected_components(graph), key=len, default=set())
+    if len(largest) < 3:
+        return {}
+    members = graph.subgraph([name for name in names if name in largest])
+    placed = nx.spectral_layout(members)
+    return {name: np.array([x, y, 0.0]) for name, (x, y) in placed.items()}
+
+
+def _finite(names: tuple[str, ...], positions: Points) -> list[tuple[str, Points]]:
+    whole = np.asarray(np.isfinite(positions).all(axis=1))
+    return [(name, positions[i]) for i, name in enumerate(names) if whole[i]]
+
+
+def _between_partners(
+    evidence: Evidence, placed: dict[str, Points]
+) -> tuple[dict[str, Points], tuple[str, ...]]:
+    partners: dict[str, list[str]] = {name: [] for name in evidence.names if name not in placed}
+    for a, b in sorted(evidence.truth):
+        for name, other in ((a, b), (b, a)):
+            if name in partners and other in placed:
+                partners[name].append(other)
+    found = {
+        name: np.mean([placed[other] for other in others], axis=0)
+        for name, others in partners.items()
+        if others
+    }
+    return {**placed, **found}, tuple(found)
+
+
+def _core(points: Points) -> Points:
+    """Drop the farthest tenth of the points: a few wild ones would tilt the ground."""
+    if len(points) < 10:
+        return points
+    distance = np.linalg.norm(points - np.median(points, axis=0), axis=1)
+    return points[distance <= np.quantile(distance, 0.9)]
