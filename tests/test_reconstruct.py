@@ -1,0 +1,201 @@
+"""Matches -> sparse models -> report."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from click.testing import CliRunner
+
+from colmap_netvlad import engine
+from colmap_netvlad.cli import cli
+from colmap_netvlad.database import image_names
+from colmap_netvlad.errors import InputError
+from colmap_netvlad.mapping.incremental import map_incremental
+from colmap_netvlad.mapping.output import free_output
+from colmap_netvlad.mapping.summary import ModelSummary, combine, registered_names, summarize
+from colmap_netvlad.matching import MatchReport
+from colmap_netvlad.project import Project
+from colmap_netvlad.reconstruct import (
+    ReconstructReport,
+    map_and_report,
+    reconstruct,
+    report_lines,
+    report_table,
+    working_copy,
+)
+
+MakeProject = Callable[..., Project]
+MATCHED = MatchReport(requested=66, already=66, matched=0, verified=50, seconds=0.0)
+
+
+def write_all_pairs(project: Project) -> None:
+    names = image_names(project.database)
+    lines = (f"{a} {b}\n" for i, a in enumerate(names) for b in names[i + 1 :])
+    project.pairs.write_text("".join(lines), encoding="utf-8")
+
+
+def poses(model: pycolmap.Reconstruction) -> dict[str, np.ndarray]:
+    return {
+        model.image(i).name: model.image(i).cam_from_world().matrix() for i in model.reg_image_ids()
+    }
+
+
+def test_reconstruct_writes_the_model_and_prints_its_figures(project_copy: MakeProject) -> None:
+    project = project_copy(matched=True)
+    write_all_pairs(project)
+    result = CliRunner().invoke(cli, ["reconstruct", "--db", str(project.database)])
+    assert result.exit_code == 0, result.output
+    model = pycolmap.Reconstruction(project.sparse / "0")
+    assert model.num_reg_images() == 12
+    for figure in ("12 of 12", f"{model.num_points3D():,}", "66 matched before", "mapping"):
+        assert figure in result.stdout
+    assert "Matches are in" in result.stdout
+    assert max(map(len, result.stdout.splitlines())) < 400
+    colours = {tuple(point.color) for point in model.points3D.values()}
+    assert len(colours) > 10  # points are coloured from the photos
+
+
+def test_two_runs_give_the_same_model_and_the_first_one_stays(project_copy: MakeProject) -> None:
+    project = project_copy(matched=True)
+    first = map_and_report(project, MATCHED)
+    files = {path: path.read_bytes() for path in project.sparse.rglob("*") if path.is_file()}
+    second = map_and_report(project, MATCHED)
+    assert second.output == project.folder / "sparse-2"
+    assert {path: path.read_bytes() for path in files} == files
+    assert (first.models, first.missing) == (second.models, second.missing)
+    one, two = (pycolmap.Reconstruction(report.output / "0") for report in (first, second))
+    for name, pose in poses(one).items():
+        assert np.array_equal(pose, poses(two)[name])
+
+
+def test_map_without_photos_works_on_the_database_alone(
+    project_copy: MakeProject, tmp_path: Path
+) -> None:
+    models = map_incremental(project_copy(matched=True).database, None, tmp_path / "out" / "sparse")
+    assert sum(model.num_reg_images() for model in models) == 12
+    assert (tmp_path / "out" / "sparse" / "0" / "images.bin").is_file()
+
+
+def test_copy_leaves_the_database_byte_identical(project_copy: MakeProject) -> None:
+    project = project_copy()
+    write_all_pairs(project)
+    before = hashlib.sha256(project.database.read_bytes()).hexdigest()
+    arguments = ["reconstruct", "--db", str(project.database), "--copy"]
+    result = CliRunner().invoke(cli, arguments)
+    assert result.exit_code == 0, result.output
+    assert hashlib.sha256(project.database.read_bytes()).hexdigest() == before
+    assert (project.sparse / "0").is_dir() and "66 now" in result.stdout
+    again = CliRunner().invoke(cli, arguments)
+    assert "66 matched before" in again.stdout and "sparse-2" in again.stdout
+
+
+def test_a_copy_of_other_features_is_made_anew(project_copy: MakeProject) -> None:
+    project = project_copy(matched=True)
+    copy = working_copy(project)
+    assert copy.database.name == "project.copy.db" and copy.images == project.images
+    copy.database.write_bytes(project_copy(name="other").database.read_bytes())
+    marked = copy.database.stat().st_ino
+    assert working_copy(project).database.stat().st_ino == marked  # same images and features
+    connection = pycolmap.Database.open(copy.database)
+    connection.clear_keypoints()
+    connection.close()
+    assert working_copy(project).database.stat().st_ino != marked
+
+
+def test_an_interrupted_mapping_leaves_no_trace(
+    project_copy: MakeProject, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    project = project_copy(matched=True)
+
+    def stop(*arguments: object, **options: object) -> object:
+        call(*arguments, **options)
+        raise KeyboardInterrupt
+
+    call = engine.call
+    monkeypatch.setattr(engine, "call", stop)
+    before = {path.name for path in project.folder.iterdir()}
+    with pytest.raises(KeyboardInterrupt):
+        map_and_report(project, MATCHED)
+    after = {path.name for path in project.folder.iterdir()}
+    assert {name for name in after - before if not name.endswith(("-wal", "-shm"))} == set()
+
+
+def test_a_given_output_that_exists_is_left_alone(
+    project_copy: MakeProject, tmp_path: Path
+) -> None:
+    (tmp_path / "taken").mkdir()
+    (tmp_path / "taken" / "notes.txt").touch()
+    assert free_output(tmp_path / "taken") == tmp_path / "taken-2"
+    assert free_output(tmp_path / "new") == tmp_path / "new"
+    with pytest.raises(InputError, match="exists already and is left as it is"):
+        map_incremental(project_copy(matched=True).database, None, tmp_path / "taken")
+
+
+def test_what_is_missing_for_a_reconstruction_is_said(project_copy: MakeProject) -> None:
+    project = project_copy()
+    with pytest.raises(InputError, match="make it with `colmap-netvlad pairs`"):
+        reconstruct(project)
+    project.pairs.write_text("# nothing\n")
+    with pytest.raises(InputError, match="lists no pairs"):
+        reconstruct(project)
+    project.pairs.write_text("a.jpg b.jpg\n")
+    with pytest.raises(InputError, match=r"a\.jpg"):
+        reconstruct(project)
+    result = CliRunner().invoke(
+        cli, ["reconstruct", "--db", str(project.database), "--mapper", "magic"]
+    )
+    assert result.exit_code == 1 and "There is no mapper magic; choose incremental" in result.stderr
+
+
+def test_photos_that_do_not_overlap_are_said(project_copy: MakeProject) -> None:
+    project = project_copy()
+    names = image_names(project.database)
+    project.pairs.write_text(f"{names[0]} {names[-1]}\n")  # opposite corners of the flight
+    with pytest.raises(InputError, match="None of the 1 pairs could be verified"):
+        reconstruct(project)
+    assert not project.sparse.exists()
+
+
+def test_images_left_out_are_counted_and_named(project_copy: MakeProject) -> None:
+    project = project_copy()
+    names = image_names(project.database)
+    lines = [f"{a} {b}\n" for i, a in enumerate(names[:8]) for b in names[i + 1 : 8]]
+    project.pairs.write_text("".join(lines))
+    report = reconstruct(project)
+    assert set(report.missing) >= set(names[8:])
+    assert report.images == 12 and report.total.registered == 12 - len(report.missing)
+    assert f"Not registered: {len(report.missing)} of 12 images: " in report_lines(report)[-1]
+
+
+def test_summaries_count_an_image_of_two_models_once(project_copy: MakeProject) -> None:
+    (model,) = map_incremental(
+        (project := project_copy(matched=True)).database, None, project.sparse
+    )
+    one, both = summarize(model), combine([model, model])
+    assert one.registered == both.registered == len(registered_names([model])) == 12
+    assert both.points == 2 * one.points and both.observations == 2 * one.observations
+    assert both.mean_reprojection_error == pytest.approx(one.mean_reprojection_error)
+    assert both.mean_track_length == pytest.approx(one.observations / one.points)
+    assert 0 < one.mean_reprojection_error < 2 < one.mean_track_length
+    empty = summarize(pycolmap.Reconstruction())
+    assert empty.points == 0 and math.isnan(empty.mean_reprojection_error)
+    assert combine([]).registered == 0
+
+
+def test_the_report_shows_each_component_and_the_total(tmp_path: Path) -> None:
+    model = ModelSummary(5, 1000, 0.5, 3.0, 3000)
+    report = ReconstructReport(
+        tmp_path, 20, MATCHED, [model], model, [f"{i}.jpg" for i in range(15)], {"matching": 90.0}
+    )
+    assert report_table(report).row_count == 1
+    assert report_table(replace(report, models=[model, model])).row_count == 3
+    text = "\n".join(report_lines(report))
+    assert "15 of 20 images: 0.jpg" in text and "9.jpg, ..." in text and "10.jpg" not in text
+    assert "matching 1.5" in text
