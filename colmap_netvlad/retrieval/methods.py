@@ -12,7 +12,7 @@ from colmap_netvlad.errors import InputError
 from colmap_netvlad.models.catalogue import CATALOGUE
 from colmap_netvlad.pairs import check_k
 from colmap_netvlad.project import Project
-from colmap_netvlad.retrieval import baselines, bow, deep, spatial, vlad
+from colmap_netvlad.retrieval import baselines, bow, deep, hybrid, spatial, vlad
 from colmap_netvlad.retrieval.ranking import Ranking
 
 CHECKPOINT_SUFFIXES = (".safetensors", ".mat")
@@ -82,6 +82,12 @@ METHODS: dict[str, Method] = {
             vlad.rank,
         ),
         Method(
+            "hybrid",
+            "The default deep model and VLAD added up, with query expansion: ours.",
+            frozenset({"photos", "features"}),
+            hybrid.rank,
+        ),
+        Method(
             "spatial",
             "Nearest on the ground by position priors or GPS, as COLMAP's spatial matcher.",
             frozenset({"positions"}),
@@ -126,7 +132,8 @@ def rank(project: Project, name: str | Path, options: RetrievalOptions | None = 
             is not there.
     """
     options = options or RetrievalOptions()
-    method = find_method(options.model or name)
+    # `hybrid` is told its deep model by --model; for the others a model is the method.
+    method = find_method(name if str(name) == "hybrid" else options.model or name)
     count = len(image_names(project.database))
     k = check_k(options.k, count)
     ranking = method.rank(project, replace(options, k=k))
