@@ -59,6 +59,36 @@ cache_option = click.option(
 seed_option = click.option(
     "--seed", default=0, show_default=True, help="Seed of every random choice."
 )
+method_option = click.option(
+    "--method",
+    default="hybrid",
+    show_default=True,
+    help="Retrieval method of --rounds; `colmap-netvlad methods` lists them.",
+)
+copy_option = click.option(
+    "--copy",
+    is_flag=True,
+    help="Leave the database as it is and write matches into <name>.copy.db beside it.",
+)
+
+
+def rounds_options(command: Command) -> Command:
+    """Add the options of matching in rounds."""
+    for option in (
+        click.option(
+            "--budget",
+            type=int,
+            help="Most pairs that --rounds matches.  [default: k times the number of images]",
+        ),
+        click.option(
+            "--rounds",
+            type=int,
+            help="Match in this many rounds, each choosing its pairs by what the earlier ones"
+            " taught, instead of a pairs list.",
+        ),
+    ):
+        command = option(command)
+    return command
 
 
 def verbose_option(command: Command) -> Command:
@@ -187,11 +217,11 @@ def features(images: Path, database: Path, **options: Any) -> None:
     show_default=True,
     help="How the model is built.",
 )
-@click.option(
-    "--copy",
-    is_flag=True,
-    help="Leave the database as it is and write matches into <name>.copy.db beside it.",
-)
+@copy_option
+@rounds_options
+@k_option
+@method_option
+@device_option
 @seed_option
 @verbose_option
 def reconstruct(
@@ -201,6 +231,11 @@ def reconstruct(
     output: Path | None,
     mapper: str,
     copy: bool,
+    rounds: int | None,
+    budget: int | None,
+    k: int,
+    method: str,
+    device: str | None,
     seed: int,
 ) -> None:
     """Match the pairs, verify them, and build the sparse model.
@@ -217,6 +252,7 @@ def reconstruct(
     from colmap_netvlad.reconstruct import (
         ReconstructOptions,
         check_mapper,
+        map_and_report,
         report_lines,
         report_table,
         working_copy,
@@ -229,15 +265,150 @@ def reconstruct(
     output = output or project.sparse
     if copy:
         project = working_copy(project)
-    report = run(
-        project,
-        pairs,
-        output,
-        ReconstructOptions(mapper, MappingOptions(seed=seed), MatchOptions(seed=seed)),
-    )
+    options = ReconstructOptions(mapper, MappingOptions(seed=seed), MatchOptions(seed=seed))
+    if rounds is None:
+        report = run(project, pairs, output, options)
+    else:
+        matches = match_and_print_rounds(project, rounds, budget, k, method, device, seed)
+        report = map_and_report(project, matches, output, options)
     Console().print(report_table(report))
     click.echo("\n".join(report_lines(report)))
     click.echo(f"Matches are in {project.database}, models in {report.output}.")
+
+
+@cli.command()
+@database_option
+@images_option
+@click.option(
+    "--pairs",
+    type=click.Path(path_type=Path),
+    help="Pairs list (COLMAP's, .csv or .json).  [default: pairs.txt beside the database]",
+)
+@copy_option
+@rounds_options
+@k_option
+@method_option
+@device_option
+@seed_option
+@verbose_option
+def match(
+    database: Path | None,
+    images: Path | None,
+    pairs: Path | None,
+    copy: bool,
+    rounds: int | None,
+    budget: int | None,
+    k: int,
+    method: str,
+    device: str | None,
+    seed: int,
+) -> None:
+    """Match and verify the pairs of a list, or spend a budget of pairs in --rounds.
+
+    This writes matches into the database, where COLMAP keeps them (--copy does not); one of
+    COLMAP 3.x is brought to the schema of COLMAP 4. A stopped run goes on where it stopped.
+    """
+    from colmap_netvlad.database import image_names
+    from colmap_netvlad.matching import MatchOptions, match_pairs
+    from colmap_netvlad.pairs import read_pairs
+    from colmap_netvlad.project import find_project
+    from colmap_netvlad.reconstruct import working_copy
+
+    project = find_project(database, images)
+    listed = pairs or project.pairs
+    if copy:
+        project = working_copy(project)
+    if rounds is None:
+        chosen = read_pairs(listed, image_names(project.database))
+        report = match_pairs(project.database, chosen, MatchOptions(seed=seed))
+    else:
+        report = match_and_print_rounds(project, rounds, budget, k, method, device, seed)
+    click.echo(
+        f"Pairs: {report.requested:,} ({report.already:,} matched before), {report.verified:,} "
+        f"verified, {report.seconds / 60:.1f} minutes. Matches are in {project.database}."
+    )
+
+
+def match_and_print_rounds(
+    project: Project,
+    rounds: int,
+    budget: int | None,
+    k: int,
+    method: str,
+    device: str | None,
+    seed: int,
+) -> MatchReport:
+    """Match in rounds and print a line for each."""
+    from colmap_netvlad.match_rounds import rank_and_match_in_rounds, rounds_lines
+    from colmap_netvlad.matching import MatchOptions
+    from colmap_netvlad.retrieval.methods import RetrievalOptions
+
+    options = RetrievalOptions(k=k, device=device, seed=seed)
+    spent = rank_and_match_in_rounds(
+        project, method, options, rounds, budget, MatchOptions(seed=seed)
+    )
+    for line in rounds_lines(spent):
+        click.echo(line)
+    return spent.matches
+
+
+@cli.command()
+@database_option
+@click.option(
+    "--images",
+    "--image_path",
+    "images",
+    type=click.Path(path_type=Path),
+    help="The photo folder, with the new photos copied beside the old ones."
+    "  [default: the folder used last, else images/ beside the database]",
+)
+@click.option(
+    "--sparse",
+    type=click.Path(path_type=Path),
+    help="Folder of the model to extend.  [default: sparse/0, or 0 of the newest sparse-N]",
+)
+@click.option(
+    "--output",
+    "--output_path",
+    "output",
+    type=click.Path(path_type=Path),
+    help="Folder of the extended model.  [default: the next sparse-N beside the database]",
+)
+@click.option("--among-new", is_flag=True, help="Pair the new photos with each other as well.")
+@k_option
+@method_option
+@device_option
+@seed_option
+@verbose_option
+def add(
+    database: Path | None,
+    images: Path | None,
+    sparse: Path | None,
+    output: Path | None,
+    among_new: bool,
+    k: int,
+    method: str,
+    device: str | None,
+    seed: int,
+) -> None:
+    """Register new photos into an existing model.
+
+    This writes the database: features and matches of the new photos. Only what is new is
+    computed: a new photo is paired with its k most likely partners among the old ones. The old
+    model is left as it is, the extended one is written beside it.
+    """
+    from colmap_netvlad.add import AddOptions, add_lines, add_photos, newest_model
+    from colmap_netvlad.project import find_project
+    from colmap_netvlad.retrieval.methods import RetrievalOptions
+
+    project = find_project(database, images)
+    options = AddOptions(
+        method, RetrievalOptions(k=k, device=device, seed=seed), among_new=among_new, seed=seed
+    )
+    report = add_photos(project, sparse or newest_model(project), options, output)
+    for line in add_lines(report):
+        click.echo(line)
+    finish_partial([f"Left out: {name} {reason}" for name, reason in report.features.bad])
 
 
 def quoted(path: Path) -> str:
@@ -347,6 +518,88 @@ def demo(output: Path, method: str | None, seed: int) -> None:
     flight = replace(DEMO_FLIGHT, seed=seed)
     if not run_demo(output, method or DEFAULT, flight, console.print).passed:
         sys.exit(1)
+
+
+@cli.command()
+@database_option
+@images_option
+@click.option(
+    "--methods",
+    default="bow,vlad",
+    show_default=True,
+    help="Methods, and checkpoints by path, with commas; `colmap-netvlad methods` lists them.",
+)
+@click.option(
+    "--k",
+    "ks",
+    default="30",
+    show_default=True,
+    help="Partners retrieved for each image, one number or several: 10,20,30.",
+)
+@click.option(
+    "--output",
+    type=click.Path(path_type=Path),
+    help="Folder of the comparison.  [default: <database>-compare beside the database]",
+)
+@click.option(
+    "--reconstruct/--no-reconstruct",
+    "build",
+    default=True,
+    help="Make each method's model, or stop after matching.  [default: make it]",
+)
+@click.option(
+    "--reconstruct-k", type=int, help="Which of --k the models are made from.  [default: largest]"
+)
+@click.option("--vocab-tree", type=FILE, help="Vocabulary tree of the method bow.")
+@click.option("--yes", is_flag=True, help="Do not ask before a long exhaustive matching.")
+@cache_option
+@device_option
+@seed_option
+@verbose_option
+def compare(
+    database: Path | None,
+    images: Path | None,
+    methods: str,
+    ks: str,
+    output: Path | None,
+    build: bool,
+    reconstruct_k: int | None,
+    vocab_tree: Path | None,
+    yes: bool,
+    cache: Path | None,
+    device: str | None,
+    seed: int,
+) -> None:
+    """Compare retrieval methods on your own flight, and write a report page.
+
+    Each method starts from the features of the database, which is only read; all work is done on
+    copies in the comparison's folder. Pairs that several methods ask for are matched once. A
+    killed run goes on where it stopped, and methods can be added in a later run. A method that
+    fails is listed at the end, the others finish (exit code 3).
+    """
+    from colmap_netvlad.compare import CompareOptions
+    from colmap_netvlad.compare import compare as run
+    from colmap_netvlad.compare.pipeline import parse_ks
+    from colmap_netvlad.project import find_project
+    from colmap_netvlad.report.comparison import print_comparison
+    from colmap_netvlad.retrieval.methods import RetrievalOptions
+
+    def confirm(question: str) -> bool:
+        return yes or (sys.stdin.isatty() and click.confirm(question, err=True))
+
+    options = CompareOptions(
+        ks=parse_ks(ks),
+        output=output,
+        reconstruct=build,
+        reconstruct_k=reconstruct_k,
+        retrieval=RetrievalOptions(device=device, vocab_tree=vocab_tree),
+        seed=seed,
+    )
+    names = [name.strip() for name in methods.split(",") if name.strip()]
+    comparison, workspace = run(find_project(database, images, cache), names, options, confirm)
+    print_comparison(comparison)
+    click.echo(f"Report: {workspace.html} (figures: {workspace.json.name}, {workspace.csv.name})")
+    finish_partial([f"Not finished: {sentence}" for sentence in comparison.incomplete])
 
 
 def finish_partial(left_out: list[str]) -> None:

@@ -144,6 +144,20 @@ def compare(
     return comparison, workspace
 
 
+def parse_ks(text: str) -> tuple[int, ...]:
+    """Read `10,20,30`.
+
+    Raises:
+        InputError: it is not a list of whole numbers.
+    """
+    try:
+        return tuple(int(part) for part in text.split(",") if part.strip())
+    except ValueError:
+        raise InputError(
+            f"--k is {text!r}; it is a whole number or several with commas, as in --k 10,20,30."
+        ) from None
+
+
 def write_report(workspace: Workspace, comparison: Comparison, evidence: Evidence) -> None:
     """Write `compare.json`, `compare.csv` and `compare.html`."""
     from colmap_netvlad.report.comparison import write_csv
