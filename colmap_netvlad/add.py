@@ -129,6 +129,29 @@ def add_photos(
     )
 
 
+def add_lines(report: AddReport) -> list[str]:
+    """Return what `colmap-netvlad add` prints."""
+    registered = len(report.new) - len(report.unregistered)
+    lines = [
+        f"New photos: {len(report.new):,}, {registered:,} registered "
+        f"({report.before.registered:,} -> {report.after.registered:,} images, "
+        f"{report.before.points:,} -> {report.after.points:,} points, reprojection error "
+        f"{report.before.mean_reprojection_error:.3f} -> "
+        f"{report.after.mean_reprojection_error:.3f} px).",
+        f"Pairs: {report.matches.matched:,} matched, {report.matches.verified:,} verified.",
+        "Minutes: "
+        + ", ".join(f"{stage} {time / 60:.1f}" for stage, time in report.seconds.items())
+        + ".",
+    ]
+    if report.unregistered:
+        lines.append(
+            f"Not registered: {', '.join(report.unregistered[:10])}"
+            f"{', ...' if len(report.unregistered) > 10 else ''}; photos that overlap only other "
+            "new ones need --among-new, or `pairs` and `reconstruct` anew."
+        )
+    return [*lines, f"The extended model is in {report.output}."]
+
+
 def newest_model(project: Project) -> Path:
     """Return `0` of the highest-numbered `sparse`, `sparse-2`, ... folder of a workspace.
 

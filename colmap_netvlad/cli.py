@@ -10,12 +10,16 @@ import shlex
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
 from colmap_netvlad import __version__
 from colmap_netvlad.errors import EXIT_PARTIAL
+
+if TYPE_CHECKING:
+    from colmap_netvlad.matching import MatchReport
+    from colmap_netvlad.project import Project
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 

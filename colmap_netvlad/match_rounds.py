@@ -6,25 +6,31 @@ import hashlib
 import json
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 from scipy import sparse
 
 from colmap_netvlad.connect import components, connecting_pairs
-from colmap_netvlad.database import open_database
+from colmap_netvlad.database import image_names, open_database
 from colmap_netvlad.errors import InputError
 from colmap_netvlad.matching import MatchOptions, MatchReport, match_pairs
 from colmap_netvlad.metrics import CORRECT_MATCHES
+from colmap_netvlad.pairs import check_k
 from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval.fusion import similarity_matrix
+from colmap_netvlad.retrieval.hybrid import fusion_depth
+from colmap_netvlad.retrieval.methods import RetrievalOptions, rank
 from colmap_netvlad.retrieval.ranking import Ranking
 from colmap_netvlad.retrieval.store import Store
 from colmap_netvlad.rounds import IndexPair, next_round, split_budget
 
 CONNECTING_SHARE = 0.05
 """Extra budget for pairs between components, as a share of the budget."""
+
+MOST_LISTED = 10
+"""Images listed by name for each component apart."""
 
 PLAN_SETTING = "rounds"
 """Where the cache keeps the rounds chosen so far."""
@@ -91,6 +97,48 @@ def match_in_rounds(
     ids = _check(project, ranking, budget, rounds)
     plan = _Plan.load(project, ranking, budget, rounds)
     return _Run(project, ranking, budget, rounds, matching, ids, plan).spend()
+
+
+def rank_and_match_in_rounds(
+    project: Project,
+    method: str,
+    options: RetrievalOptions,
+    rounds: int,
+    budget: int | None = None,
+    matching: MatchOptions = MatchOptions(),
+) -> RoundsReport:
+    """Rank deeply by a method and match in rounds; see `match_in_rounds`.
+
+    Args:
+        options: `k` sets the budget where none is given: k times the number of images.
+
+    Raises:
+        InputError: as `methods.rank` and `match_in_rounds`.
+    """
+    count = len(image_names(project.database))
+    check_k(options.k, count)
+    deeper = replace(options, k=min(fusion_depth(options.k), count - 1))
+    ranking = rank(project, method, deeper)
+    spend = plan_budget(options.k, count) if budget is None else budget
+    return match_in_rounds(project, ranking, spend, rounds, matching)
+
+
+def rounds_lines(report: RoundsReport) -> list[str]:
+    """Return a line for each round, and what fell apart."""
+    lines = [
+        f"{r.title.capitalize()}: {r.pairs:,} pairs, {r.correct:,} with more than "
+        f"{CORRECT_MATCHES} verified matches"
+        + (f" ({100 * r.correct / r.pairs:.0f} %)" if r.pairs else "")
+        for r in report.rounds
+    ]
+    spent = report.matches.requested
+    if spent < report.budget:
+        lines.append(f"Stopped at {spent:,} of {report.budget:,} pairs: nothing promising is left.")
+    for group in report.components[1:]:
+        shown = ", ".join(group[:MOST_LISTED])
+        more = f", and {len(group) - MOST_LISTED} more" if len(group) > MOST_LISTED else ""
+        lines.append(f"Apart from the largest component: {len(group)}: {shown}{more}")
+    return lines
 
 
 def plan_budget(k: int, num_images: int) -> int:
