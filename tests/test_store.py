@@ -70,7 +70,9 @@ def test_equal_basenames_in_different_folders_are_kept_apart(cache: Path) -> Non
     vectors = unit_vectors(2, 8)
     with Store(cache) as store:
         store.add_descriptors("m", ["east/1.jpg", "west/1.jpg"], ["x", "y"], vectors, 0)
-        np.testing.assert_allclose(store.read_vectors("m", ["west/1.jpg"])[0], vectors[1], atol=1e-3)
+        np.testing.assert_allclose(
+            store.read_vectors("m", ["west/1.jpg"])[0], vectors[1], atol=1e-3
+        )
 
 
 def test_a_ranking_comes_back_with_its_order_and_scores(cache: Path) -> None:
@@ -98,13 +100,13 @@ def test_a_cache_of_another_version_is_refused(cache: Path) -> None:
     Store(cache).close()
     with closing(sqlite3.connect(cache)) as connection:
         connection.execute("PRAGMA user_version = 99")
-    with pytest.raises(InputError, match="format 99.*delete"):
+    with pytest.raises(InputError, match=r"format 99.*delete"):
         Store(cache)
 
 
 def test_a_file_that_is_not_sqlite_is_called_damaged(cache: Path) -> None:
     cache.write_bytes(b"not a database at all" * 100)
-    with pytest.raises(InputError, match="damaged.*delete it"):
+    with pytest.raises(InputError, match=r"damaged.*delete it"):
         Store(cache)
 
 
