@@ -87,23 +87,28 @@ def call(function: Callable[..., Result], folder: Path, *arguments: Any, **optio
     token = pycolmap.CancellationToken()
     outcome: list[Result] = []
     faults: list[BaseException] = []
+    # An event and not `Thread.join`: Ctrl-C inside a join makes Python 3.11 take the running
+    # thread for a finished one, and the process would end under COLMAP's feet.
+    finished = threading.Event()
 
     def run() -> None:
         try:
             outcome.append(function(*arguments, cancellation_token=token, **options))
         except BaseException as fault:  # handed to the caller's thread below
             faults.append(fault)
+        finally:
+            finished.set()
 
     thread = threading.Thread(target=run, name="pycolmap", daemon=True)
     thread.start()
     try:
-        while thread.is_alive():
-            thread.join(WATCH_SECONDS)
+        while not finished.wait(WATCH_SECONDS):
             _check_space(folder)
     except BaseException:
         token.cancel()
-        thread.join()
+        finished.wait()
         raise
+    thread.join()
     if faults:
         raise faults[0]
     return outcome[0]
