@@ -16,6 +16,7 @@ import click
 
 from colmap_netvlad import __version__
 from colmap_netvlad.errors import EXIT_PARTIAL
+from colmap_netvlad.training.command import SettingsCommand
 
 if TYPE_CHECKING:
     from colmap_netvlad.matching import MatchReport
@@ -604,6 +605,97 @@ def compare(
     print_comparison(comparison)
     click.echo(f"Report: {workspace.html} (figures: {workspace.json.name}, {workspace.csv.name})")
     finish_partial([f"Not finished: {sentence}" for sentence in comparison.incomplete])
+
+
+@cli.command()
+@click.argument("datasets", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option(
+    "--output",
+    type=FOLDER,
+    help="Where annotations and working files go, a folder for each scene.  [default: beside"
+    " each scene's photos]",
+)
+@click.option(
+    "--databases",
+    type=FOLDER,
+    help="Folder of matched COLMAP databases, <scene>.db: a scene found there is neither extracted"
+    " nor matched again; the database is copied and stays as it is.",
+)
+@click.option(
+    "--method", default="bow", show_default=True, help="Retrieval method that chooses the pairs."
+)
+@k_option
+@click.option("--mapper", default="incremental", show_default=True, help="Mapping method.")
+@seed_option
+@verbose_option
+def annotate(
+    datasets: tuple[Path, ...],
+    output: Path | None,
+    databases: Path | None,
+    method: str,
+    k: int,
+    mapper: str,
+    seed: int,
+) -> None:
+    """Annotate scenes for training: which photos see the same 3D points.
+
+    DATASETS are folders of scenes (<scene>/images, or photos right in <scene>), or single scenes.
+    Each scene is reconstructed; the number of common 3D points of its photos (GS) is saved as
+    annotation.npz. Scenes annotated before are passed over.
+    """
+    from colmap_netvlad.training import annotate as annotation
+
+    options = annotation.AnnotateOptions(method, k, output, databases, mapper, seed)
+    report = annotation.annotate(datasets, options)
+    for line in annotation.table_lines(report.scenes):
+        click.echo(line)
+    finish_partial(report.left_out)
+
+
+@cli.command(cls=SettingsCommand)
+@click.argument("datasets", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option(
+    "--output", type=FOLDER, required=True, help="Folder of the run; an unfinished one goes on."
+)
+@click.option(
+    "--validation",
+    multiple=True,
+    type=click.Path(path_type=Path),
+    help="Annotated scenes never trained on, by which the best epoch is chosen.",
+)
+@click.option("--leave-out", multiple=True, help="Name of a scene in DATASETS not to train on.")
+@click.option("--recipe", type=FILE, help="TOML file of settings; options given here come first.")
+@click.option("--name", help="What the model calls itself.  [default: the run's folder]")
+@device_option
+@click.pass_context
+def train(
+    context: click.Context,
+    datasets: tuple[Path, ...],
+    output: Path,
+    validation: tuple[Path, ...],
+    leave_out: tuple[str, ...],
+    recipe: Path | None,
+    name: str | None,
+    device: str | None,
+    **settings: Any,
+) -> None:
+    """Train a descriptor model on annotated scenes (the paper's recipe by default).
+
+    DATASETS are what `annotate` annotated. OUTPUT gets best.safetensors, to be used as
+    `--model`, the training curves, and a checkpoint that a stopped run goes on from.
+    """
+    from colmap_netvlad.training.command import settings_of
+    from colmap_netvlad.training.run import report_lines
+    from colmap_netvlad.training.run import train as run
+    from colmap_netvlad.training.scenes import load_dataset
+
+    options = settings_of(context, recipe)
+    measured = load_dataset(validation)
+    scenes = load_dataset(datasets, (*leave_out, *(scene.name for scene in measured)))
+    report = run(scenes, measured, options, output, device=device, name=name)
+    for line in report_lines(report):
+        click.echo(line)
+    finish_partial(report.left_out)
 
 
 def finish_partial(left_out: list[str]) -> None:

@@ -10,7 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from colmap_netvlad.training.losses import LOSSES, LossOptions
+from colmap_netvlad.training.losses import LOSSES, LossOptions, keep_similarities
 from colmap_netvlad.training.sampling import Query
 
 
@@ -65,7 +65,22 @@ def literal_ranked_list(x: np.ndarray, queries: list[Query], options: LossOption
     return mean(per_query, options.nontrivial)
 
 
+def literal_softmax(x: np.ndarray, queries: list[Query], options: LossOptions) -> float:
+    per_query = []
+    for q in queries:
+        values = []
+        for p in q.positives:
+            share = math.exp(float(x[q.anchor] @ x[p]) / options.temperature)
+            others = sum(
+                math.exp(float(x[q.anchor] @ x[n]) / options.temperature) for n in q.negatives
+            )
+            values.append(-math.log(share / (share + others)))
+        per_query.append(sum(values) / len(values))
+    return sum(per_query) / len(per_query)
+
+
 LITERAL = {
+    "softmax": literal_softmax,
     "triplet": literal_triplet,
     "contrastive": literal_contrastive,
     "ranked-list": literal_ranked_list,
@@ -138,8 +153,8 @@ def test_nontrivial_average_is_not_thinned_by_easy_negatives() -> None:
     easy = torch.tensor([[-1.0, 0.0, 0.0]]).repeat(100, 1)
     few = torch.cat([anchor, anchor, hard])
     many = torch.cat([few, easy])
-    for loss in LOSSES.values():
-        options = LossOptions()
+    for name in ("triplet", "contrastive", "ranked-list"):
+        loss, options = LOSSES[name], LossOptions()
         alone = loss(few, [Query(0, (1,), (2,))], options)
         among = loss(many, [Query(0, (1,), tuple(range(2, 103)))], options)
         assert alone > 0
@@ -158,3 +173,19 @@ def test_ranked_list_asks_for_the_order_of_geometric_similarity() -> None:
     assert loss(x, wrong, LossOptions()).item() == pytest.approx(
         distance(x[0].numpy(), x[2].numpy()) - distance(x[0].numpy(), x[1].numpy())
     )
+
+
+def test_keeping_similarities_costs_nothing_when_they_are_the_teachers() -> None:
+    x, _ = random_batch(1, 3, 2)
+    other, _ = random_batch(2, 3, 2)
+    assert keep_similarities(x, x @ x.T).item() == 0
+    wanted = other @ other.T
+    expected = np.mean(
+        [
+            (float(x[i] @ x[j]) - float(wanted[i, j])) ** 2
+            for i in range(len(x))
+            for j in range(len(x))
+            if i != j
+        ]
+    )
+    assert keep_similarities(x, wanted).item() == pytest.approx(float(expected))

@@ -10,13 +10,24 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from colmap_netvlad.errors import InputError
+from colmap_netvlad.training.augment import (
+    Augmentation,
+    PseudoOptions,
+    View,
+    draw_view,
+    pseudo_scene,
+    render,
+    visible,
+)
 from colmap_netvlad.training.sampling import (
     Batch,
+    Query,
     Sampler,
     SamplingOptions,
     nearest_of_other_scenes,
 )
 from colmap_netvlad.training.scenes import Scene, symmetric
+from colmap_netvlad.training.visibility import by_views
 
 
 def strip(name: str, images: int, reach: int = 3) -> Scene:
@@ -32,6 +43,7 @@ def strip(name: str, images: int, reach: int = 3) -> Scene:
         names=tuple(f"{i}.jpg" for i in range(images)),
         common_points=symmetric(pairs, images),
         matches=symmetric(pairs, images),
+        sizes=np.tile(np.array([40, 30], np.int32), (images, 1)),
         model=np.zeros(images, np.int32),
         poses=np.zeros((images, 7)),
         points=100,
@@ -130,6 +142,23 @@ def test_global_mining_takes_the_nearest_photos_of_other_scenes() -> None:
     assert len(nearest_of_other_scenes(descriptors, 0, 0)) == 3
 
 
+def test_flight_batches_use_all_relations_of_many_photos_of_few_flights() -> None:
+    flights = scenes(3, images=15)
+    options = SamplingOptions(mining="flight", scenes=2, flight_photos=10)
+    (batch,) = Sampler(flights, options).batches(0, 1)
+    assert len(batch.samples) == 20 and len({scene for scene, _ in batch.samples}) == 2
+    assert len(batch.queries) > 15
+    for query in batch.queries:
+        scene, anchor = roles(batch, query.anchor)
+        similarity = flights[scene].common_points.toarray()[anchor]
+        apart = set(flights[scene].apart(anchor).tolist())
+        own = {i for s, i in batch.samples if s == scene}
+        assert {roles(batch, r) for r in query.negatives} == {(scene, i) for i in apart & own}
+        assert {roles(batch, r) for r in query.positives} == {
+            (scene, int(i)) for i in np.flatnonzero(similarity > 15) if i in own
+        }
+
+
 def test_one_scene_alone_is_refused_unless_same_flight_negatives_are_asked_for() -> None:
     with pytest.raises(InputError, match="one usable scene only"):
         Sampler(scenes(1), SamplingOptions())
@@ -148,3 +177,74 @@ def test_a_scene_with_too_few_photos_is_left_out_and_named() -> None:
     assert all(s != 2 for batch in sampler.batches(0, 10) for s, _ in batch.samples)
     with pytest.raises(InputError, match="No scene can give a batch"):
         Sampler([strip("tiny", 3), strip("small", 2)], SamplingOptions())
+
+
+def test_views_that_show_other_parts_of_two_photos_are_no_positives() -> None:
+    """Two photos of the same ground: GS is counted over what both views show."""
+    photo = (400, 300)
+    options = PseudoOptions(views=6, seed=1)
+    scene = pseudo_scene(strip("a", 2), 0, photo, options)
+    assert len(scene) == 6
+    batch = Batch(((0, 0), (0, 1), (0, 2)), (Query(0, (1, 2), ()),))
+    whole = np.stack([np.eye(3)] * 3)
+    kept = by_views(batch, [scene], whole, photo, 0)
+    similarity = scene.common_points.toarray()
+    (query,) = kept.queries
+    assert set(query.positives) == {i for i in (1, 2) if similarity[0, i] > 0}
+    assert [similarity[0, i] for i in query.positives] == sorted(
+        (similarity[0, i] for i in query.positives), reverse=True
+    )
+    aside = whole.copy()
+    aside[1] = [[1, 0, 5], [0, 1, 0], [0, 0, 1]]  # shows nothing of the cut
+    (query,) = by_views(batch, [scene], aside, photo, 0).queries
+    assert 1 not in query.positives and 1 in query.negatives
+    aside[2] = aside[1]
+    assert by_views(batch, [scene], aside, photo, 0).queries == ()
+    unknown = [strip("b", 3)]
+    assert by_views(batch, unknown, aside, photo, 0) == batch, "nothing is known of observations"
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 1000), width=st.integers(100, 500), height=st.integers(100, 500))
+def test_overlap_of_pseudo_scenes_is_that_of_their_pixels(
+    seed: int, width: int, height: int
+) -> None:
+    """Paint what view 0 shows on the photo; view 1 finds as much of it as GS says."""
+    photo = (width, height)
+    scene = pseudo_scene(strip("a", 2), 1, photo, PseudoOptions(views=2, seed=seed))
+    assert scene.crops is not None
+    inside = np.zeros((height, width, 3), np.uint8)
+    for y in range(height):
+        xs = (np.arange(width) + 0.5 - width / 2) / max(photo)
+        ys = np.full(width, (y + 0.5 - height / 2) / max(photo))
+        inside[y] = 255 * visible(scene.crops[0], np.stack([xs, ys], 1), photo)[0][:, None]
+    shown = render(inside, View(np.eye(3)), photo, scene.crops[1])
+    # Grid points of view 1 that are painted, against GS of the two views.
+    assert scene.observations is not None
+    _, at = scene.observations.of(1)
+    columns = np.clip(np.rint(at[:, 0] * max(photo) + width / 2 - 0.5), 0, width - 1)
+    rows = np.clip(np.rint(at[:, 1] * max(photo) + height / 2 - 0.5), 0, height - 1)
+    painted = int((shown[rows.astype(int), columns.astype(int), 0] > 127).sum())
+    assert abs(painted - scene.common_points[0, 1]) <= 0.08 * len(at) + 2
+
+
+def test_views_are_the_same_for_the_same_seed_and_turn_by_any_angle() -> None:
+    turns = []
+    for seed in range(40):
+        drawn = [
+            draw_view(np.random.default_rng(seed), (400, 300), (96, 64), Augmentation())
+            for _ in range(2)
+        ]
+        assert np.array_equal(drawn[0].homography, drawn[1].homography)
+        x, y = drawn[0].homography[:2, 0]
+        turns.append(np.degrees(np.arctan2(y, x)) % 360)
+    assert all(any(low <= t < low + 90 for t in turns) for low in (0, 90, 180, 270))
+
+
+def test_a_view_without_changes_is_the_photo() -> None:
+    photo = np.random.default_rng(0).integers(0, 255, (48, 64, 3)).astype(np.uint8)
+    assert np.array_equal(render(photo, View(np.eye(3)), (64, 48)), photo)
+    half = render(photo, View(np.eye(3)), (32, 24))
+    assert abs(float(half.mean()) - float(photo.mean())) < 3
+    bright = render(photo, View(np.eye(3), brightness=30.0), (64, 48))
+    assert bright.mean() > photo.mean() + 15

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -22,6 +21,7 @@ from colmap_netvlad.models.backbones import build_trunk
 from colmap_netvlad.models.checkpoint import load_model, read_metadata
 from colmap_netvlad.models.network import GlobalDescriptor
 from colmap_netvlad.training import run as run_module
+from colmap_netvlad.training.augment import View
 from colmap_netvlad.training.inputs import KeptFeatures, Photos
 from colmap_netvlad.training.options import TrainOptions, read_recipe
 from colmap_netvlad.training.run import Run, train
@@ -58,6 +58,7 @@ def _flight(folder: Path, seed: int) -> Scene:
         names=tuple(flight.names),
         common_points=symmetric(pairs, count),
         matches=symmetric(pairs, count),
+        sizes=np.tile(np.array([128, 96], np.int32), (count, 1)),
         model=np.zeros(count, np.int32),
         poses=np.zeros((count, 7)),
         points=1000,
@@ -119,11 +120,11 @@ def _die_after(monkeypatch: pytest.MonkeyPatch, steps: int) -> None:
     "settings",
     [
         {},
-        {"views": 2},
+        {"views": 2, "mining": "flight", "loss": "softmax", "keep_local": 0.5, "warm_up": 2},
         {"mining": "global", "loss": "triplet"},
         {"aggregation": "gem", "pseudo_views": 6, "teacher": "start", "frozen": None},
     ],
-    ids=["new views", "kept features", "global mining", "pseudo-scenes and teacher"],
+    ids=["new views", "kept features of flights", "global mining", "pseudo-scenes and teacher"],
 )
 def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(
     settings: dict[str, object],
@@ -296,13 +297,13 @@ def test_kept_features_go_on_where_a_killed_run_stopped(
     part.parent.mkdir()
     part.write_bytes(content[: len(content) // 2 + 7])
     made: list[int] = []
-    original = KeptFeatures._view
+    original = KeptFeatures._draw
 
-    def counted(self: KeptFeatures, number: int) -> np.ndarray:
+    def counted(self: KeptFeatures, number: int) -> tuple[int, int, View]:
         made.append(number)
         return original(self, number)
 
-    monkeypatch.setattr(KeptFeatures, "_view", counted)
+    monkeypatch.setattr(KeptFeatures, "_draw", counted)
     KeptFeatures(photos, network, options, tmp_path / "part")
     assert part.read_bytes() == content
     assert made == list(range(8, 16))
@@ -341,7 +342,7 @@ def test_a_full_disk_is_one_sentence(
     monkeypatch.undo()
     saved = torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True)
     assert saved["number"] == 1
-    assert os.listdir(tmp_path / "run").count("checkpoint.pt") == 1
+    assert [path.name for path in (tmp_path / "run").glob("*checkpoint*")] == ["checkpoint.pt"]
 
 
 def test_recipes_are_read_and_checked(tmp_path: Path) -> None:
@@ -401,5 +402,8 @@ def test_the_defaults_are_the_papers_recipe() -> None:
         "same_flight": 0,
     }
     assert {key: recipe[key] for key in paper} == paper
-    alphas = {kind: TrainOptions(aggregation=kind).for_losses().alpha for kind in ("netvlad", "gem", "max")}
+    alphas = {
+        kind: TrainOptions(aggregation=kind).for_losses().alpha
+        for kind in ("netvlad", "gem", "max")
+    }
     assert alphas == {"netvlad": 1.35, "gem": 0.9, "max": 0.9}

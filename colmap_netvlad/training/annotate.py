@@ -2,22 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import shutil
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
 from colmap_netvlad.database import copy_database, open_database
 from colmap_netvlad.errors import InputError
-from colmap_netvlad.images import PHOTO_SUFFIXES, find_photos, photo_fingerprint
+from colmap_netvlad.images import (
+    PHOTO_SUFFIXES,
+    BadPhoto,
+    find_photos,
+    photo_fingerprint,
+    read_header,
+)
+from colmap_netvlad.progress import console
 from colmap_netvlad.training.scenes import (
     ANNOTATION,
+    Observations,
     Scene,
     check_disjoint,
+    common_points,
     load_annotation,
     save_annotation,
     symmetric,
@@ -99,27 +108,26 @@ def find_scenes(datasets: Sequence[Path]) -> list[SceneFolder]:
     return found
 
 
-def annotate(
-    datasets: Sequence[Path],
-    options: AnnotateOptions,
-    announce: Callable[[str], None] = lambda name: None,
-) -> AnnotateReport:
+def annotate(datasets: Sequence[Path], options: AnnotateOptions) -> AnnotateReport:
     """Annotate all scenes of datasets that are not annotated yet.
 
     A scene that does not reconstruct, or whose photos are in an earlier scene as well, is
     reported and skipped. A killed run goes on with the scene it was at, with the pairs already
     matched.
 
-    Args:
-        announce: called with the name of each scene before it is worked on.
-
     Raises:
         InputError: no scenes, or a fault that concerns them all (an unknown method, say).
     """
+    from colmap_netvlad.mapping import MAPPERS
+    from colmap_netvlad.retrieval.methods import find_method
+
     report = AnnotateReport()
+    find_method(options.method)
+    if options.mapper not in MAPPERS:
+        raise InputError(f"No mapper is called {options.mapper!r}: there are {', '.join(MAPPERS)}.")
     for folder in find_scenes(datasets):
+        console.print(f"Scene {folder.name}", highlight=False)
         try:
-            announce(folder.name)
             scene = annotate_scene(folder, options)
             check_disjoint([*report.scenes, scene])
             report.scenes.append(scene)
@@ -140,16 +148,55 @@ def annotate_scene(folder: SceneFolder, options: AnnotateOptions) -> Scene:
     photos = find_photos(folder.images)
     if path.exists():
         scene = load_annotation(path)
-        if set(scene.names) == set(photos):
+        if _is_current(scene, photos):
             return scene
     work = target if options.output else target / "annotation"
     work.mkdir(parents=True, exist_ok=True)
     database = work / "database.db"
     method = _matched_database(folder, database, options)
+    shutil.rmtree(work / "sparse", ignore_errors=True)  # ours, of a run that was killed
     models = _map(database, folder.images, work / "sparse", options)
     scene = scene_of(folder, database, models, method)
     save_annotation(scene, path)
     return scene
+
+
+def table_lines(scenes: Sequence[Scene]) -> list[str]:
+    """Return the table of scenes, like the paper's table 1."""
+    if not scenes:
+        return []
+    width = max(len("scene"), *(len(scene.name) for scene in scenes))
+    head = f"{'scene':{width}}  images  registered   points    pairs  overlap  matched by"
+    lines = [head]
+    for scene in scenes:
+        lines.append(
+            f"{scene.name:{width}}  {len(scene):6,}  {scene.registered:10,}  {scene.points:7,}  "
+            f"{scene.pairs:7,}  {scene.overlap:7.1f}  {scene.method}"
+        )
+    if len(scenes) > 1:
+        images, registered = (
+            sum(count) for count in zip(*((len(s), s.registered) for s in scenes), strict=True)
+        )
+        points, pairs = sum(s.points for s in scenes), sum(s.pairs for s in scenes)
+        lines.append(
+            f"{'all':{width}}  {images:6,}  {registered:10,}  {points:7,}  {pairs:7,}  "
+            f"{2 * pairs / max(registered, 1):7.1f}"
+        )
+    return lines
+
+
+def _is_current(scene: Scene, photos: Sequence[str]) -> bool:
+    """Whether an annotation has all photos of its folder but broken ones."""
+    new = set(photos) - set(scene.names)
+    return set(scene.names) <= set(photos) and not any(_is_whole(scene.images / n) for n in new)
+
+
+def _is_whole(path: Path) -> bool:
+    try:
+        read_header(path)
+    except BadPhoto:
+        return False
+    return True
 
 
 def scene_of(
@@ -168,39 +215,38 @@ def scene_of(
         verified = opened.verified_matches()
     index = {row.image_id: number for number, row in enumerate(rows)}
     names = tuple(row.name for row in rows)
-    observed = [_observations(model, names) for model in models]
-    counts = np.stack(
-        [np.zeros(len(names)), *(np.asarray(o.sum(axis=1)).ravel() for o in observed)]
-    )
-    model_of = np.where(counts.any(0), counts[1:].argmax(0) if models else -1, -1)
+    sizes = np.array([(row.width, row.height) for row in rows], np.int32).reshape(-1, 2)
+    model_of = _models_of(models, names)
     registered = int((model_of >= 0).sum())
     if registered < MIN_REGISTERED:
         raise InputError(
             f"it does not reconstruct ({registered} of {len(names)} photos registered); "
             "its photos overlap too little, or are of different places."
         )
-    poses = np.full((len(names), 7), np.nan)
-    common = sparse.csr_array((len(names), len(names)), dtype=np.int32)
-    for number, (model, seen) in enumerate(zip(models, observed, strict=True)):
-        own = model_of == number
-        _fill_poses(poses, model, names, own)
-        inside = sparse.diags_array(own.astype(np.int32)) @ seen
-        common = common + inside @ inside.T
-    common = sparse.csr_array(common - sparse.diags_array(common.diagonal()))
-    common.eliminate_zeros()
+    seen, points = _observations(models, model_of, names, sizes)
     complete = len(verified) == len(names) * (len(names) - 1) // 2
+    matches = [(index[a], index[b], n) for (a, b), n in verified.items() if n]
     return Scene(
         name=folder.name,
         images=folder.images,
         names=names,
-        common_points=common.astype(np.int32),
-        matches=symmetric([(index[a], index[b], n) for (a, b), n in verified.items()], len(names)),
-        model=model_of.astype(np.int32),
-        poses=poses,
-        points=sum(model.num_points3D() for model in models),
+        common_points=common_points(seen, points),
+        matches=symmetric(matches, len(names)),
+        sizes=sizes,
+        model=model_of,
+        poses=_poses(models, model_of, names),
+        points=points,
         method="exhaustive" if complete else method,
-        fingerprints=tuple(photo_fingerprint(folder.images / name) for name in names),
+        fingerprints=tuple(_fingerprint(folder.images / name) for name in names),
+        observations=seen,
     )
+
+
+def _fingerprint(path: Path) -> str:
+    try:
+        return photo_fingerprint(path)
+    except BadPhoto as fault:
+        raise InputError(f"the photo {path} of its database {fault}.") from fault
 
 
 def _scene_in(folder: Path) -> SceneFolder | None:
@@ -239,41 +285,75 @@ def _map(
     database: Path, images: Path, output: Path, options: AnnotateOptions
 ) -> list[pycolmap.Reconstruction]:
     from colmap_netvlad.mapping import MAPPERS
-    from colmap_netvlad.mapping.incremental import MappingOptions
+    from colmap_netvlad.mapping.options import MappingOptions
 
     return MAPPERS[options.mapper](database, images, output, MappingOptions(seed=options.seed))
 
 
-def _observations(model: pycolmap.Reconstruction, names: Sequence[str]) -> sparse.csr_array:
-    """Return (N, P) sparse, 1 where an image observes a 3D point of the model."""
-    row_of = {name: row for row, name in enumerate(names)}
-    row_of_id = {
+def _images_of(model: pycolmap.Reconstruction, row_of: dict[str, int]) -> dict[int, int]:
+    """Return the rows of a model's registered images by image id."""
+    return {
         image_id: row_of[image.name]
         for image_id, image in model.images.items()
         if image.has_pose and image.name in row_of
     }
-    rows: list[int] = []
-    columns: list[int] = []
-    for column, point in enumerate(model.points3D.values()):
-        images = {element.image_id for element in point.track.elements} & row_of_id.keys()
-        rows += [row_of_id[image] for image in images]
-        columns += [column] * len(images)
-    shape = (len(names), max(model.num_points3D(), 1))
-    ones = np.ones(len(rows), np.int32)
-    return sparse.coo_array((ones, (rows, columns)), shape=shape).tocsr()
 
 
-def _fill_poses(
-    poses: NDArray[np.float64],
-    model: pycolmap.Reconstruction,
-    names: Sequence[str],
-    own: NDArray[np.bool_],
-) -> None:
+def _models_of(
+    models: Sequence[pycolmap.Reconstruction], names: Sequence[str]
+) -> NDArray[np.int32]:
+    """Return (N,) the model of each image: the one with most of its points, or -1."""
     row_of = {name: row for row, name in enumerate(names)}
-    for image in model.images.values():
-        row = row_of.get(image.name)
-        if row is None or not own[row] or not image.has_pose:
-            continue
-        pose = image.cam_from_world()
-        x, y, z, w = pose.rotation.quat
-        poses[row] = [w, x, y, z, *pose.translation]
+    model_of = np.full(len(names), -1, np.int32)
+    most = np.zeros(len(names), int)
+    for number, model in enumerate(models):
+        for image_id, row in _images_of(model, row_of).items():
+            count = model.images[image_id].num_points3D
+            if count > most[row]:
+                model_of[row], most[row] = number, count
+    return model_of
+
+
+def _observations(
+    models: Sequence[pycolmap.Reconstruction],
+    model_of: NDArray[np.int32],
+    names: Sequence[str],
+    sizes: NDArray[np.int32],
+) -> tuple[Observations, int]:
+    """Return what each image observes of its own model's points, and the number of points."""
+    row_of = {name: row for row, name in enumerate(names)}
+    points: list[NDArray[np.int64]] = [np.zeros(0, np.int64)] * len(names)
+    at: list[NDArray[np.float64]] = [np.zeros((0, 2))] * len(names)
+    total = 0
+    for number, model in enumerate(models):
+        ids = np.sort(np.fromiter(model.points3D.keys(), np.uint64, model.num_points3D()))
+        for image_id, row in _images_of(model, row_of).items():
+            if model_of[row] != number:
+                continue
+            found = [
+                (p.point3D_id, *p.xy) for p in model.images[image_id].get_observation_points2D()
+            ]
+            table = np.array(found, np.float64).reshape(-1, 3)
+            number_of = total + np.searchsorted(ids, table[:, 0].astype(np.uint64))
+            # A point may be observed twice in one photo; it counts once.
+            points[row], kept = np.unique(number_of, return_index=True)
+            at[row] = (table[kept, 1:] - sizes[row] / 2) / sizes[row].max()
+        total += len(ids)
+    first = np.cumsum([0, *map(len, points)])
+    every = np.concatenate(points).astype(np.int32)
+    return Observations(first, every, np.concatenate(at).astype(np.float32)), total
+
+
+def _poses(
+    models: Sequence[pycolmap.Reconstruction], model_of: NDArray[np.int32], names: Sequence[str]
+) -> NDArray[np.float64]:
+    """Return (N, 7) qw qx qy qz tx ty tz, NaN where not registered."""
+    row_of = {name: row for row, name in enumerate(names)}
+    poses = np.full((len(names), 7), np.nan)
+    for number, model in enumerate(models):
+        for image_id, row in _images_of(model, row_of).items():
+            if model_of[row] == number:
+                pose = model.images[image_id].cam_from_world()
+                x, y, z, w = pose.rotation.quat
+                poses[row] = [w, x, y, z, *pose.translation]
+    return poses

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_netvlad.training.scenes import Scene, symmetric
+from colmap_netvlad.training.scenes import Observations, Scene, common_points
 
 Size = tuple[int, int]
 """Width and height in pixels."""
@@ -151,36 +151,40 @@ def pseudo_scene(scene: Scene, image: int, photo: Size, options: PseudoOptions) 
     rng = np.random.default_rng([options.seed, zlib.crc32(f"{scene.name}/{name}".encode())])
     cut = Augmentation(scale=options.scale, perspective=0.05, illumination=0.0)
     crops = np.stack([draw_view(rng, photo, photo, cut).homography for _ in range(options.views)])
-    seen = visible_points(crops, photo).astype(np.int64)
-    common = seen @ seen.T
-    rows, columns = np.nonzero(np.triu(common, k=1))
-    table = symmetric(
-        zip(rows.tolist(), columns.tolist(), common[rows, columns].tolist(), strict=True),
-        options.views,
-    )
+    wide, high = _extent(photo)
+    xs = (np.arange(round(GRID * wide)) + 0.5) / GRID - wide / 2
+    ys = (np.arange(max(round(GRID * high), 1)) + 0.5) / GRID - high / 2
+    grid = np.stack([a.ravel() for a in np.meshgrid(xs, ys)], axis=1)
+    shown = [visible(crop, grid, photo) for crop in crops]
+    first = np.cumsum([0, *(inside.sum() for inside, _ in shown)])
+    points = np.concatenate([np.flatnonzero(inside) for inside, _ in shown])
+    at = np.concatenate([moved[inside] for inside, moved in shown])
+    seen = Observations(first, points.astype(np.int32), at.astype(np.float32))
+    table = common_points(seen, len(grid))
     return Scene(
         name=f"{scene.name}/{name}",
         images=scene.images,
         names=(name,) * options.views,
         common_points=table,
         matches=table,
+        sizes=np.tile(np.asarray(photo, np.int32), (options.views, 1)),
         model=np.zeros(options.views, np.int32),
         poses=np.full((options.views, 7), np.nan),
-        points=int(seen.any(0).sum()),
+        points=len(np.unique(points)),
         method="pseudo",
+        observations=seen,
         crops=crops,
     )
 
 
-def visible_points(crops: NDArray[np.float64], photo: Size) -> NDArray[np.bool_]:
-    """Return (N, P) which of the photo's grid points each of N views of its shape shows."""
-    wide, high = _extent(photo)
-    xs = (np.arange(round(GRID * wide)) + 0.5) / GRID - wide / 2
-    ys = (np.arange(max(round(GRID * high), 1)) + 0.5) / GRID - high / 2
-    grid = np.stack([*(a.ravel() for a in np.meshgrid(xs, ys)), np.ones(len(xs) * len(ys))])
-    moved = crops @ grid
-    inside = np.abs(moved[:, :2] / moved[:, 2:]) <= np.array([wide, high])[:, None] / 2
-    return np.asarray(inside.all(1) & (moved[:, 2] > 0))
+def visible(
+    homography: NDArray[np.float64], positions: NDArray[np.floating], size: Size
+) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+    """Return which positions (M, 2) of a photo a view of `size` shows, and where (M, 2)."""
+    moved = np.c_[positions, np.ones(len(positions))] @ homography.T
+    at = moved[:, :2] / moved[:, 2:]
+    inside = (np.abs(at) <= _extent(size) / 2).all(1) & (moved[:, 2] > 0)
+    return inside, at
 
 
 def _similarity(

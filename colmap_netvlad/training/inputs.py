@@ -8,6 +8,7 @@ import math
 import shutil
 from collections import OrderedDict
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from threading import Lock
 from typing import Protocol
@@ -36,10 +37,23 @@ LARGEST_SIDE = 2048
 _VIEWS, _KEPT_VIEWS, _CHOICES = 1, 2, 3
 
 
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """Inputs of a batch.
+
+    Attributes:
+        inputs: (N, ...) for `Inputs.front`.
+        homographies: (N, 3, 3) from each photo to its view.
+    """
+
+    inputs: Tensor
+    homographies: NDArray[np.float64]
+
+
 class Inputs(Protocol):
     """Where a batch's inputs come from."""
 
-    def batch(self, batch: Batch, epoch: int, number: int) -> Tensor:
+    def batch(self, batch: Batch, epoch: int, number: int) -> Drawn:
         """Return the inputs of batch `number` of an epoch; the same whenever asked for."""
 
     def front(self, network: SplitNetwork, inputs: Tensor) -> Tensor:
@@ -88,12 +102,15 @@ class Photos:
                 self._bytes -= self._kept.popitem(last=False)[1].nbytes
         return pixels
 
-    def view(self, scene: int, image: int, rng: np.random.Generator) -> NDArray[np.uint8]:
-        """Return a random view (H, W, 3) of a photo, or of a pseudo-scene's cut of it."""
+    def draw(self, scene: int, image: int, rng: np.random.Generator) -> View:
+        """Draw a random view of a photo, or of a pseudo-scene's cut of it."""
+        width, height = self.scenes[scene].sizes[image].tolist()
+        return draw_view(rng, (width, height), self.size, self._augmentation)
+
+    def render(self, scene: int, image: int, view: View) -> NDArray[np.uint8]:
+        """Render a view that `draw` drew: (H, W, 3)."""
         photo = self.photo(scene, image, self._options.scale_min)
-        # A pseudo-scene's cut has its photo's shape.
-        drawn = draw_view(rng, photo.shape[1::-1], self.size, self._augmentation)
-        return render(photo, drawn, self.size, self._crop(scene, image))
+        return render(photo, view, self.size, self._crop(scene, image))
 
     def whole(self, scene: int, image: int, long_side: int) -> NDArray[np.uint8]:
         """Return a photo, or a pseudo-scene's cut of it, upright and whole: (H, W, 3)."""
@@ -104,17 +121,15 @@ class Photos:
         size = decoded_size(photo.shape[1::-1], long_side)
         return render(photo, View(np.eye(3)), size, self._crop(scene, image))
 
-    def batch(self, batch: Batch, epoch: int, number: int) -> Tensor:
+    def batch(self, batch: Batch, epoch: int, number: int) -> Drawn:
         """Return new views, uint8 (N, 3, H, W)."""
+        seed = self._options.seed
         views = [
-            self.view(
-                scene,
-                image,
-                np.random.default_rng([self._options.seed, _VIEWS, epoch, number, row]),
-            )
-            for row, (scene, image) in enumerate(batch.samples)
+            self.draw(*sample, np.random.default_rng([seed, _VIEWS, epoch, number, row]))
+            for row, sample in enumerate(batch.samples)
         ]
-        return _stack(views)
+        rendered = [self.render(*s, view) for s, view in zip(batch.samples, views, strict=True)]
+        return Drawn(_stack(rendered), np.stack([view.homography for view in views]))
 
     def front(self, network: SplitNetwork, inputs: Tensor) -> Tensor:
         """See `Inputs`."""
@@ -156,15 +171,17 @@ class KeptFeatures:
         count = int(self._first[-1]) * self._views
         self._features = np.memmap(self.path, np.float16, mode="r", shape=(count, *self._shape))
 
-    def batch(self, batch: Batch, epoch: int, number: int) -> Tensor:
+    def batch(self, batch: Batch, epoch: int, number: int) -> Drawn:
         """Return features of one of the kept views of each photo, float16 (N, C, h, w)."""
         rng = np.random.default_rng([self._seed, _CHOICES, epoch, number])
-        views = rng.integers(self._views, size=len(batch.samples))
+        views = rng.integers(self._views, size=len(batch.samples)).tolist()
         rows = [
-            (self._first[scene] + image) * self._views + view
+            int(self._first[scene] + image) * self._views + view
             for (scene, image), view in zip(batch.samples, views, strict=True)
         ]
-        return torch.from_numpy(np.stack([self._features[row] for row in rows]))
+        homographies = [self._draw(row)[2].homography for row in rows]
+        features = np.stack([self._features[row] for row in rows])
+        return Drawn(torch.from_numpy(features), np.stack(homographies))
 
     def front(self, network: SplitNetwork, inputs: Tensor) -> Tensor:
         """See `Inputs`."""
@@ -190,19 +207,21 @@ class KeptFeatures:
                 file.seek(0, 2)
                 bar.advance(done)
                 for first in range(done, total, 8):
-                    views = [self._view(i) for i in range(first, min(first + 8, total))]
+                    drawn = [self._draw(i) for i in range(first, min(first + 8, total))]
+                    views = [self._photos.render(*one) for one in drawn]
                     features = network.front(_stack(views).to(device))
                     file.write(features.half().cpu().numpy().tobytes())
                     bar.advance(len(views))
         except OSError as fault:
             raise InputError(f"Cannot write {self.path}: {fault.strerror}.") from fault
 
-    def _view(self, number: int) -> NDArray[np.uint8]:
+    def _draw(self, number: int) -> tuple[int, int, View]:
+        """Return scene, image and view of a row of the file."""
         row, view = divmod(number, self._views)
         scene = int(np.searchsorted(self._first, row, side="right")) - 1
         image = row - int(self._first[scene])
         rng = np.random.default_rng([self._seed, _KEPT_VIEWS, scene, image, view])
-        return self._photos.view(scene, image, rng)
+        return scene, image, self._photos.draw(scene, image, rng)
 
 
 def decoded_size(photo: Sequence[int], long_side: int) -> tuple[int, int]:

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn.functional import softplus
 
 from colmap_netvlad.training.sampling import Query
 
@@ -26,6 +27,7 @@ class LossOptions:
     Attributes:
         margin: m of eq. 9 and 11, between positive and negative.
         alpha: the radius that eq. 11 pushes negatives out of.
+        temperature: of the softmax loss.
         contrastive_margin: the distance from which on a negative costs nothing.
         nontrivial: leave samples of zero loss out of the averages.
     """
@@ -33,6 +35,7 @@ class LossOptions:
     margin: float = 0.1
     alpha: float = 1.35
     contrastive_margin: float = 0.7
+    temperature: float = 0.05
     nontrivial: bool = True
 
 
@@ -88,10 +91,26 @@ def ranked_list(descriptors: Tensor, queries: Sequence[Query], options: LossOpti
     return _average(torch.stack(losses), options.nontrivial)
 
 
+def softmax(descriptors: Tensor, queries: Sequence[Query], options: LossOptions) -> Tensor:
+    """Softmax loss: of each positive, -log of its share among itself and all negatives.
+
+    With cosine similarities s and temperature T the mean over positives p of
+    log(1 + sum_n exp((s_n - s_p) / T)), averaged over queries. Source: InfoNCE, van den Oord et
+    al. 2018, eq. 4, for each positive by itself.
+    """
+    losses = []
+    for query in queries:
+        scaled = descriptors[query.anchor] @ descriptors.T / options.temperature
+        negatives = scaled[list(query.negatives)].logsumexp(0)
+        losses.append(softplus(negatives - scaled[list(query.positives)]).mean())
+    return _average(torch.stack(losses), nontrivial=False)
+
+
 LOSSES: dict[str, Loss] = {
     "ranked-list": ranked_list,
     "triplet": triplet,
     "contrastive": contrastive,
+    "softmax": softmax,
 }
 """The losses by the name that `train --loss` takes."""
 

@@ -40,6 +40,11 @@ class TrainOptions:
     )
     aggregation: str = setting("netvlad", "Aggregation layer.", choices=tuple(ALPHA))
     clusters: int = setting(64, "Centres of NetVLAD.")
+    assignment: float | None = setting(
+        None,
+        "alpha of NetVLAD's assignment at the beginning.  [default: from the features]",
+        type=float,
+    )
     start: str | None = setting(
         None, "Checkpoint to start from, instead of trunk, weights and aggregation.", type=str
     )
@@ -65,11 +70,14 @@ class TrainOptions:
     pseudo_share: float = setting(0.3, "Share of anchors from pseudo-scenes, where there are any.")
 
     # The batches.
-    mining: str = setting("nontrivial", "Sample mining: eq. 8, or eq. 7.", choices=MINING)
+    mining: str = setting(
+        "nontrivial", "Sample mining: eq. 8, eq. 7, or many photos of few flights.", choices=MINING
+    )
     scenes_per_batch: int = setting(5, "B, the anchors of a batch, each of another scene.")
     positives: int = setting(3, "M, the positives of an anchor.")
     epsilon: int = setting(15, "A positive shares more 3D points than this with its anchor.")
     hard_negatives: int = setting(2, "Negatives of an anchor in global mining.")
+    flight_photos: int = setting(32, "Photos of each scene in a flight batch.")
     same_flight: int = setting(0, "Further negatives of the anchor's flight, surely apart.")
 
     # The loss.
@@ -79,6 +87,7 @@ class TrainOptions:
         None, "Radius of eq. 11.  [default: 1.35 for netvlad, else 0.9]", type=float
     )
     contrastive_margin: float = setting(0.7, "Distance at which a negative costs nothing.")
+    temperature: float = setting(0.05, "Temperature of the softmax loss.")
     nontrivial: bool = setting(True, "Leave samples of zero loss out of the average.")
     teacher: str | None = setting(
         None,
@@ -92,9 +101,11 @@ class TrainOptions:
     iterations: int = setting(2000, "Batches of an epoch.")
     learning_rate: float = setting(1e-5, "Learning rate l_0 of Adam.")
     decay: float = setting(0.1, "The learning rate of epoch i is l_0 exp(-decay i).")
+    warm_up: int = setting(0, "Batches over which the learning rate rises to l_0.")
     head_rate: float = setting(1.0, "Factor on the learning rate of the aggregation layer.")
     momentum: float = setting(0.9, "Adam's first beta.")
     weight_decay: float = setting(5e-4, "Weight decay.")
+    keep_local: float = setting(1.0, "Share of a view's local features that a step looks at.")
     seed: int = setting(0, "Seed of every random choice.")
 
     # The model that comes out, and its measure.
@@ -128,7 +139,13 @@ class TrainOptions:
     def for_losses(self) -> LossOptions:
         """The margins of the losses."""
         alpha = ALPHA[self.aggregation] if self.alpha is None else self.alpha
-        return LossOptions(self.margin, alpha, self.contrastive_margin, self.nontrivial)
+        return LossOptions(
+            margin=self.margin,
+            alpha=alpha,
+            contrastive_margin=self.contrastive_margin,
+            temperature=self.temperature,
+            nontrivial=self.nontrivial,
+        )
 
     def for_sampling(self) -> SamplingOptions:
         """How batches are drawn."""
@@ -138,6 +155,7 @@ class TrainOptions:
             positives=self.positives,
             epsilon=self.epsilon,
             hard_negatives=self.hard_negatives,
+            flight_photos=self.flight_photos,
             same_flight=self.same_flight,
             pseudo_share=self.pseudo_share if self.pseudo_views else 0.0,
             seed=self.seed,

@@ -19,13 +19,12 @@ import hashlib
 import math
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, astuple, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from colmap_netvlad import progress
 from colmap_netvlad.errors import InputError
@@ -37,7 +36,7 @@ from colmap_netvlad.models.describe import choose_device
 from colmap_netvlad.models.network import GlobalDescriptor
 from colmap_netvlad.training.augment import pseudo_scene
 from colmap_netvlad.training.history import Epoch, write_history
-from colmap_netvlad.training.inputs import Inputs, KeptFeatures, Photos
+from colmap_netvlad.training.inputs import Drawn, Inputs, KeptFeatures, Photos
 from colmap_netvlad.training.losses import LOSSES, keep_similarities
 from colmap_netvlad.training.options import TrainOptions
 from colmap_netvlad.training.sampling import Batch, Query, Sampler
@@ -45,6 +44,7 @@ from colmap_netvlad.training.scenes import Scene, check_disjoint
 from colmap_netvlad.training.stages import SplitNetwork
 from colmap_netvlad.training.teacher import Teacher
 from colmap_netvlad.training.validate import Validation
+from colmap_netvlad.training.visibility import by_views
 
 CHECKPOINT_VERSION = 1
 
@@ -99,6 +99,22 @@ def train(
     check_disjoint([*scenes, *validation])
     run = Run(scenes, validation, options, output, device=device, name=name, metadata=metadata)
     return run.go()
+
+
+def report_lines(report: TrainReport) -> list[str]:
+    """Return what `train` prints: the model, and its scores beside those before training."""
+    lines = [f"Model: {report.best}"]
+    first, best = report.history[0], max(report.history, key=lambda entry: entry.figure)
+    if best.scores:
+        lines.append(f"Best epoch: {best.epoch}. mAP and accuracy at k = 10, 20, %:")
+    for scene, score in best.scores.items():
+        before = first.scores[scene]
+        figures = " ".join(
+            f"{100 * then:5.1f} -> {100 * now:5.1f} "
+            for then, now in zip(astuple(before), astuple(score), strict=True)
+        )
+        lines.append(f"  {scene:24} {figures}".rstrip())
+    return lines
 
 
 class Run:
@@ -157,28 +173,35 @@ class Run:
         with progress.step("Training", total) as bar:
             bar.advance(min(total, self.epoch * options.iterations + self.number))
             while self.epoch < options.epochs:
-                for batch, inputs in self._upcoming():
-                    self.losses.append(self._train_on(batch, inputs))
+                for batch, drawn in self._upcoming():
+                    self.losses.append(self._train_on(batch, drawn))
                     self.number += 1
                     bar.advance()
                     if self.number % options.checkpoint_every == 0:
                         self._save_checkpoint()
-                mean = float(np.mean(self.losses))
+                mean = float(np.nanmean(self.losses))
                 self.epoch, self.number, self.mined, self.losses = self.epoch + 1, 0, None, []
                 self._end_of_epoch(mean)
         return TrainReport(self.history, self.output / "best.safetensors", self.sampler.left_out)
 
     # A step.
 
-    def _train_on(self, batch: Batch, inputs: Tensor) -> float:
-        """Take one step of the optimiser and return the loss."""
+    def _train_on(self, batch: Batch, drawn: Drawn) -> float:
+        """Take one step of the optimiser and return the loss; NaN where no view has a positive."""
+        options = self.options
+        batch = by_views(batch, self.scenes, drawn.homographies, self.photos.size, options.epsilon)
+        if not batch.queries:
+            return math.nan
+        for group in self.optimizer.param_groups:
+            group["lr"] = self._rate() * group["factor"]
         with torch.autocast("cuda", torch.bfloat16, enabled=self.device.type == "cuda"):
-            front = self.inputs.front(self.network, inputs.to(self.device))
-            descriptors = self.network.rest(front).float()
-        loss = LOSSES[self.options.loss](descriptors, batch.queries, self.options.for_losses())
+            front = self.inputs.front(self.network, drawn.inputs.to(self.device))
+            rng = np.random.default_rng([options.seed, 2, self.epoch, self.number])
+            descriptors = self.network.rest(front, options.keep_local, rng).float()
+        loss = LOSSES[options.loss](descriptors, batch.queries, options.for_losses())
         if self.teacher is not None:
             wanted = self.teacher.similarities(batch.samples).to(self.device)
-            loss = loss + self.options.teacher_weight * keep_similarities(descriptors, wanted)
+            loss = loss + options.teacher_weight * keep_similarities(descriptors, wanted)
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         parameters = self.network.trained().values()
@@ -201,10 +224,8 @@ class Run:
             "or look at these photos."
         )
 
-    def _upcoming(self) -> Iterator[tuple[Batch, Tensor]]:
+    def _upcoming(self) -> Iterator[tuple[Batch, Drawn]]:
         """Yield the rest of the epoch's batches; the next is prepared while one is trained on."""
-        for group in self.optimizer.param_groups:
-            group["lr"] = self._rate() * group["factor"]
         batches = self._batches()[self.number :]
         with ThreadPoolExecutor(1, thread_name_prefix="inputs") as pool:
             numbers = range(self.number, self.options.iterations)
@@ -238,15 +259,19 @@ class Run:
                 rows = np.zeros((len(scene), self.network.network.dim), np.float16)
                 for image in range(len(scene)):
                     one = Batch(((number, image),), ())
-                    inputs = self.inputs.batch(one, self.epoch, image).to(self.device)
-                    front = self.inputs.front(self.network, inputs)
+                    inputs = self.inputs.batch(one, self.epoch, image).inputs
+                    front = self.inputs.front(self.network, inputs.to(self.device))
                     rows[image] = self.network.rest(front)[0].float().cpu().numpy()
                     bar.advance()
                 described.append(rows)
         return described
 
     def _rate(self) -> float:
-        return self.options.learning_rate * math.exp(-self.options.decay * self.epoch)
+        """The learning rate l_i = l_0 exp(-0.1 i) (section 4.2), after a warm-up where asked."""
+        options = self.options
+        step = self.epoch * options.iterations + self.number
+        rise = min(1.0, (step + 1) / options.warm_up) if options.warm_up else 1.0
+        return rise * options.learning_rate * math.exp(-options.decay * self.epoch)
 
     # The end of an epoch.
 
@@ -305,9 +330,9 @@ class Run:
         kept = []
         with progress.step("Local features for the centres", len(drawn)) as bar:
             for number, sample in enumerate(drawn):
-                inputs = self.inputs.batch(Batch((sample,), ()), 0, number).to(self.device)
+                inputs = self.inputs.batch(Batch((sample,), ()), 0, number).inputs
                 with torch.inference_mode():
-                    front = self.inputs.front(self.network, inputs)
+                    front = self.inputs.front(self.network, inputs.to(self.device))
                     local = self.network.features(front)[0].flatten(1).T
                 rows = rng.permutation(len(local))[: max(INITIAL_FEATURES // len(drawn), 1)]
                 kept.append(local[torch.from_numpy(rows)].cpu().float().numpy())
@@ -319,6 +344,8 @@ class Run:
                 "or lower --clusters."
             )
         layer.initialise(features, self.options.seed)
+        if self.options.assignment is not None:
+            layer.init_from_centres(layer.centres.detach().clone(), self.options.assignment)
 
     def _teacher(self, cache: Path) -> Teacher | None:
         options = self.options
@@ -417,15 +444,11 @@ def _pseudo_scenes(scenes: Sequence[Scene], options: TrainOptions) -> list[Scene
     if not options.pseudo_views:
         return []
     cut = options.for_pseudo_scenes()
-    photos = Photos(scenes, options)
-    made = []
-    with progress.step("Cutting pseudo-scenes", sum(map(len, scenes))) as bar:
-        for number, scene in enumerate(scenes):
-            for image in range(len(scene)):
-                size = photos.photo(number, image).shape[1::-1]
-                made.append(pseudo_scene(scene, image, size, cut))
-                bar.advance()
-    return made
+    return [
+        pseudo_scene(scene, image, (int(scene.sizes[image, 0]), int(scene.sizes[image, 1])), cut)
+        for scene in scenes
+        for image in range(len(scene))
+    ]
 
 
 def _spread(scenes: Sequence[Scene], limit: int, seed: int) -> list[tuple[int, int]]:

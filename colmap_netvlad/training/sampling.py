@@ -2,9 +2,12 @@
 
 Batched nontrivial sampling (eq. 6 and 8) needs no descriptors: B scenes, one anchor each, M of
 its positives; the other anchors' positives are its negatives. Global hard negative mining (eq. 7)
-describes all photos before each epoch and takes the nearest photos of other scenes. Beside the
-paper's, each anchor can get negatives of its own flight that surely show other ground: another
-flight is trivially different, and telling apart photos of one flight is the task.
+describes all photos before each epoch and takes the nearest photos of other scenes.
+
+Beside the paper's: another flight is trivially different, and telling apart photos of one flight
+is the task. So an anchor can get negatives of its own flight that surely show other ground; and
+flight batches hold many photos of few flights, all of them anchors, all relations between them
+used.
 """
 
 from __future__ import annotations
@@ -18,7 +21,7 @@ from numpy.typing import NDArray
 from colmap_netvlad.errors import InputError
 from colmap_netvlad.training.scenes import Scene
 
-MINING = ("nontrivial", "global")
+MINING = ("nontrivial", "global", "flight")
 
 
 @dataclass(frozen=True)
@@ -43,11 +46,12 @@ class SamplingOptions:
     """How batches are drawn.
 
     Attributes:
-        mining: "nontrivial" (eq. 8) or "global" (eq. 7).
+        mining: "nontrivial" (eq. 8), "global" (eq. 7), or "flight" (not the paper's).
         scenes: B, the anchors of a batch, each of another scene.
         positives: M, the positives of an anchor.
         epsilon: a positive shares more than this many 3D points with its anchor (eq. 6).
         hard_negatives: negatives of an anchor in global mining, each of another scene.
+        flight_photos: photos drawn from each scene of a flight batch.
         same_flight: further negatives of an anchor from its own flight, surely apart.
         pseudo_share: the share of anchors drawn from pseudo-scenes, 0..1.
         seed: of all draws.
@@ -58,6 +62,7 @@ class SamplingOptions:
     positives: int = 3
     epsilon: int = 15
     hard_negatives: int = 2
+    flight_photos: int = 32
     same_flight: int = 0
     pseudo_share: float = 0.0
     seed: int = 0
@@ -110,6 +115,8 @@ class Sampler:
         if len(self._anchors) > 1:
             return
         (only,) = self._anchors
+        if self.options.mining == "flight":
+            return
         if self.options.mining == "global" or not self.options.same_flight:
             raise InputError(
                 f"There is one usable scene only ({self.scenes[only].name}), and negatives come "
@@ -137,7 +144,8 @@ class Sampler:
             if descriptors is None:
                 raise ValueError("global hard negative mining needs the descriptors")
             return [self._hard_batch(rng, descriptors) for _ in range(count)]
-        return [self._nontrivial_batch(rng) for _ in range(count)]
+        draw = self._flight_batch if self.options.mining == "flight" else self._nontrivial_batch
+        return [draw(rng) for _ in range(count)]
 
     def _nontrivial_batch(self, rng: np.random.Generator) -> Batch:
         builder = _Builder()
@@ -168,6 +176,23 @@ class Sampler:
             negatives = [builder.add(*hardest[number]) for number in chosen]
             negatives += [builder.add(scene, i) for i in self._draw_apart(rng, scene, anchor)]
             queries.append(Query(row, rows, tuple(negatives)))
+        return Batch(tuple(builder.samples), tuple(queries))
+
+    def _flight_batch(self, rng: np.random.Generator) -> Batch:
+        """Many photos of each scene, every one an anchor; negatives are those surely apart."""
+        builder = _Builder()
+        queries = []
+        for scene in self._draw_scenes(rng):
+            count = len(self.scenes[scene])
+            images = np.sort(rng.permutation(count)[: self.options.flight_photos]).tolist()
+            row_of = {image: builder.add(scene, image) for image in images}
+            for image in images:
+                found = self._positives[scene][image].tolist()
+                positives = tuple(row_of[i] for i in found if i in row_of)
+                apart = self.scenes[scene].apart(image).tolist()
+                negatives = tuple(row_of[i] for i in apart if i in row_of)
+                if positives:
+                    queries.append(Query(row_of[image], positives, negatives))
         return Batch(tuple(builder.samples), tuple(queries))
 
     def _draw_scenes(self, rng: np.random.Generator) -> list[int]:

@@ -1,28 +1,34 @@
 """Annotated scenes: the photos of one flight and which of them see the same points.
 
-An annotation is one JSON file, `annotation.json`, with these keys (all lists over images are in
-the order of `names`; pairs are given once, by index, the lower first):
+An annotation is one compressed numpy archive, `annotation.npz`. N is the number of images; pairs
+are rows [i, j, count] of image indices, i < j, each pair once:
 
-- `format` ("colmap-netvlad annotation"), `version` (an integer), `scene` (its name);
-- `images`: the photo folder, relative to the annotation's folder where it lies in it, else
-  absolute;
-- `method`: how the matched pairs were chosen ("exhaustive", "bow", ...), and `photos`: how many
-  photos the folder held;
-- `names`, `fingerprints` (of the photo files), `model` (which reconstruction registered an
-  image, -1 for none), `poses` ([qw, qx, qy, qz, tx, ty, tz] from world to camera, or null);
-- `points`: the number of 3D points of all models, `overlap`: mean overlap (see `Scene.overlap`);
-- `common_points`: [i, j, GS] triples, GS(i, j) the number of common 3D points (eq. 4) where any;
-- `matches`: [i, j, n] triples, n the number of verified matches where any.
+- `card`, JSON text: `format` ("colmap-netvlad annotation"), `version`, `scene` (its name),
+  `images` (the photo folder, relative to the annotation's where it lies in it, else absolute),
+  `method` (how the matched pairs were chosen: "exhaustive", "bow", ...), `names` (N),
+  `fingerprints` (N, of the photo files), `points` (3D points of all models), `overlap` (see
+  `Scene.overlap`);
+- `sizes` (N, 2): width and height, px;
+- `model` (N,): the reconstruction that registered an image, -1 for none;
+- `poses` (N, 7): qw qx qy qz tx ty tz from world to camera, NaN where not registered;
+- `common_points` (P, 3): pairs with their number of common 3D points GS (eq. 4), where any;
+- `matches` (Q, 3): pairs with their number of verified matches, where any;
+- `observed_first` (N + 1,), `observed_point` (M,), `observed_at` (M, 2): rows
+  observed_first[i] to observed_first[i + 1] are the 3D points that image i observes, and where:
+  origin in the centre of the photo, x right, y down, unit the longer side.
 """
 
 from __future__ import annotations
 
+import io
 import json
 import os
+import zipfile
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +40,27 @@ from colmap_netvlad.metrics import CORRECT_MATCHES, Pair, as_pair
 
 FORMAT = "colmap-netvlad annotation"
 VERSION = 1
-ANNOTATION = "annotation.json"
+ANNOTATION = "annotation.npz"
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """Which 3D points each image observes, and where in the photo.
+
+    Attributes:
+        first: (N + 1,) int, rows first[i] to first[i + 1] belong to image i.
+        point: (M,) int32, index of the 3D point.
+        at: (M, 2) float32, position: origin in the photo's centre, unit its longer side.
+    """
+
+    first: NDArray[np.int64]
+    point: NDArray[np.int32]
+    at: NDArray[np.float32]
+
+    def of(self, image: int) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+        """Return the points (m,) and positions (m, 2) of an image."""
+        rows = slice(int(self.first[image]), int(self.first[image + 1]))
+        return self.point[rows], self.at[rows]
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,11 +73,13 @@ class Scene:
         names: N image names relative to it.
         common_points: (N, N) symmetric sparse int32, GS(a, b) of eq. 4, diagonal empty.
         matches: (N, N) symmetric sparse int32, verified matches, diagonal empty.
+        sizes: (N, 2) int, width and height of the photos, px (their ratio matters).
         model: (N,) int, index of the reconstruction an image is registered in, or -1.
         poses: (N, 7) qw qx qy qz tx ty tz, world to camera; NaN where not registered.
         points: number of 3D points.
         method: how the matched pairs were chosen; "exhaustive" makes `matches` complete.
         fingerprints: of the photo files, for finding equal photos in two scenes.
+        observations: the 3D points that each image observes, or None where not known.
         crops: (N, 3, 3) for pseudo-scenes: the homography from a photo to the view cut from it,
             in the coordinates of `augment`; None where a photo is taken whole.
     """
@@ -61,12 +89,14 @@ class Scene:
     names: tuple[str, ...]
     common_points: sparse.csr_array
     matches: sparse.csr_array
+    sizes: NDArray[np.int32]
     model: NDArray[np.int32]
     poses: NDArray[np.float64]
     points: int
     method: str
     fingerprints: tuple[str, ...] = ()
-    crops: NDArray[np.float64] | None = field(default=None)
+    observations: Observations | None = None
+    crops: NDArray[np.float64] | None = None
 
     def __len__(self) -> int:
         return len(self.names)
@@ -118,29 +148,43 @@ class Scene:
         }
 
 
+NO_OBSERVATIONS = Observations(
+    np.zeros(1, np.int64), np.zeros(0, np.int32), np.zeros((0, 2), np.float32)
+)
+
+
 def save_annotation(scene: Scene, path: Path) -> None:
     """Write an annotation whole or not at all.
 
     Raises:
         InputError: the folder cannot be written, or the disk is full.
     """
-    record = {
+    card = {
         "format": FORMAT,
         "version": VERSION,
         "scene": scene.name,
         "images": _relative(scene.images, path.parent),
         "method": scene.method,
-        "photos": len(scene),
         "names": list(scene.names),
         "fingerprints": list(scene.fingerprints),
-        "model": scene.model.tolist(),
-        "poses": [None if np.isnan(pose).any() else pose.tolist() for pose in scene.poses],
         "points": scene.points,
         "overlap": round(scene.overlap, 3),
-        "common_points": _triples(scene.common_points),
-        "matches": _triples(scene.matches),
     }
-    write_atomically(path, json.dumps(record, ensure_ascii=False))
+    seen = scene.observations or NO_OBSERVATIONS
+    archive = io.BytesIO()
+    np.savez_compressed(
+        archive,
+        card=np.array(json.dumps(card, ensure_ascii=False)),
+        sizes=scene.sizes,
+        model=scene.model,
+        poses=scene.poses,
+        common_points=_triples(scene.common_points),
+        matches=_triples(scene.matches),
+        observed_first=seen.first,
+        observed_point=seen.point,
+        observed_at=seen.at,
+    )
+    write_atomically(path, archive.getvalue())
 
 
 def load_annotation(path: Path) -> Scene:
@@ -152,17 +196,22 @@ def load_annotation(path: Path) -> Scene:
     if not path.is_file():
         raise InputError(f"{path} does not exist; `colmap-netvlad annotate` makes it.")
     try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-        found = record["format"], record["version"]
-    except (ValueError, KeyError, TypeError) as fault:
-        raise InputError(f"{path} is not an annotation of colmap-netvlad ({fault}).") from fault
+        with np.load(path) as archive:
+            tables = dict(archive)
+        card = json.loads(str(tables.pop("card")))
+        found = card["format"], card["version"]
+    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as fault:
+        raise InputError(
+            f"{path} is not an annotation of colmap-netvlad, or damaged; remove it and run "
+            "`colmap-netvlad annotate` again."
+        ) from fault
     if found != (FORMAT, VERSION):
         raise InputError(
             f"{path} is an annotation of version {found[1]}, this program reads version "
             f"{VERSION}; remove the file and run `colmap-netvlad annotate` again."
         )
     try:
-        return _scene_of(record, path.parent)
+        return _scene_of(card, tables, path.parent)
     except (ValueError, KeyError, TypeError, IndexError) as fault:
         raise InputError(f"{path} is damaged ({fault}); remove it and annotate again.") from fault
 
@@ -194,13 +243,9 @@ def load_dataset(datasets: Iterable[Path], leave_out: Sequence[str] = ()) -> lis
     """Load all annotated scenes of datasets, but those named in `leave_out`.
 
     Raises:
-        InputError: a name in `leave_out` is no scene, or what `load_annotation` and
-            `check_disjoint` raise.
+        InputError: what `load_annotation` and `check_disjoint` raise.
     """
     scenes = [load_annotation(path) for path in find_annotations(datasets)]
-    unknown = set(leave_out) - {scene.name for scene in scenes}
-    if unknown:
-        raise InputError(f"No scene is named {', '.join(sorted(unknown))}.")
     kept = [scene for scene in scenes if scene.name not in leave_out]
     check_disjoint(kept)
     return kept
@@ -231,10 +276,10 @@ def check_disjoint(scenes: Sequence[Scene]) -> None:
 
 
 def symmetric(
-    triples: Iterable[tuple[int, int, int]] | Sequence[Sequence[int]], size: int
+    triples: Sequence[tuple[int, int, int]] | NDArray[np.integer], size: int
 ) -> sparse.csr_array:
     """Build a symmetric (size, size) matrix of counts from (i, j, count), each pair once."""
-    table = np.asarray(list(triples), dtype=np.int64).reshape(-1, 3)
+    table = np.asarray(triples, dtype=np.int64).reshape(-1, 3)
     rows, columns, counts = table.T
     if len(table) and (min(rows.min(), columns.min()) < 0 or (rows == columns).any()):
         raise ValueError("a pair of an image with itself or with no image")
@@ -248,34 +293,47 @@ def symmetric(
     return both.tocsr()
 
 
-def _triples(matrix: sparse.csr_array) -> list[list[int]]:
+def common_points(seen: Observations, points: int) -> sparse.csr_array:
+    """Return (N, N) GS (eq. 4) of all images: the number of points that both observe."""
+    ones = np.ones(len(seen.point), np.int32)
+    shape = (len(seen.first) - 1, max(points, 1))
+    observes = sparse.csr_array((ones, seen.point, seen.first), shape=shape)
+    observes.data = np.ones_like(observes.data)
+    common = sparse.csr_array(observes @ observes.T)
+    common = sparse.csr_array(common - sparse.diags_array(common.diagonal(), dtype=np.int32))
+    common.eliminate_zeros()
+    return common.astype(np.int32)
+
+
+def _triples(matrix: sparse.csr_array) -> NDArray[np.int32]:
     upper = sparse.triu(matrix, k=1).tocoo()
-    table = np.stack([upper.row, upper.col, upper.data], axis=1).astype(int)
-    return table[np.lexsort((table[:, 1], table[:, 0]))].tolist()
+    table = np.stack([upper.row, upper.col, upper.data], axis=1).astype(np.int32)
+    return table[np.lexsort((table[:, 1], table[:, 0]))]
 
 
-def _scene_of(record: dict, folder: Path) -> Scene:
-    names = tuple(record["names"])
-    empty = [float("nan")] * 7
-    poses = [pose or empty for pose in record["poses"]]
-    if not len(names) == len(poses) == len(record["model"]):
-        raise ValueError("its lists have different lengths")
-    images = (folder / record["images"]).resolve()
+def _scene_of(card: dict[str, Any], tables: dict[str, NDArray[Any]], folder: Path) -> Scene:
+    names = tuple(card["names"])
+    if any(len(tables[key]) != len(names) for key in ("sizes", "model", "poses")):
+        raise ValueError("its tables have different lengths")
+    images = (folder / card["images"]).resolve()
     if not images.is_dir():
         raise InputError(
-            f"The photos of scene {record['scene']} are gone: there is no folder {images}."
+            f"The photos of scene {card['scene']} are gone: there is no folder {images}."
         )
+    seen = Observations(*(tables[f"observed_{key}"] for key in ("first", "point", "at")))
     return Scene(
-        name=record["scene"],
+        name=card["scene"],
         images=images,
         names=names,
-        common_points=symmetric(record["common_points"], len(names)),
-        matches=symmetric(record["matches"], len(names)),
-        model=np.asarray(record["model"], dtype=np.int32),
-        poses=np.asarray(poses, dtype=np.float64).reshape(-1, 7),
-        points=int(record["points"]),
-        method=str(record["method"]),
-        fingerprints=tuple(record["fingerprints"]),
+        common_points=symmetric(tables["common_points"], len(names)),
+        matches=symmetric(tables["matches"], len(names)),
+        sizes=tables["sizes"],
+        model=tables["model"],
+        poses=tables["poses"],
+        points=int(card["points"]),
+        method=str(card["method"]),
+        fingerprints=tuple(card["fingerprints"]),
+        observations=seen if len(seen.first) == len(names) + 1 else None,
     )
 
 

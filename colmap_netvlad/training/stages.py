@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -110,9 +111,21 @@ class SplitNetwork(nn.Module):
             x = layer(x.clone() if x is front else x)
         return x
 
-    def rest(self, front: Tensor) -> Tensor:
-        """Frozen features (B, C, h, w) to descriptors (B, dim), L2-normalised."""
-        descriptors: Tensor = self.network.aggregation(self.features(front))
+    def rest(
+        self, front: Tensor, share: float = 1.0, rng: np.random.Generator | None = None
+    ) -> Tensor:
+        """Frozen features (B, C, h, w) to descriptors (B, dim), L2-normalised.
+
+        Args:
+            share: of the local features that are aggregated; below 1 they are drawn by `rng`.
+        """
+        features = self.features(front)
+        if share < 1 and rng is not None:
+            features = features.flatten(2)
+            count = features.shape[2]
+            drawn = np.sort(rng.permutation(count)[: max(1, round(share * count))])
+            features = features[:, :, torch.from_numpy(drawn).to(features.device)].unsqueeze(2)
+        descriptors: Tensor = self.network.aggregation(features)
         whitening = self.network.whitening
         return descriptors if whitening is None else whitening(descriptors)
 
