@@ -218,9 +218,24 @@ def features(images: Path, database: Path, **options: Any) -> None:
 )
 @click.option(
     "--mapper",
-    default="incremental",
+    default="auto",
     show_default=True,
-    help="How the model is built.",
+    help="How the model is built: incremental (COLMAP's), parallel (in clusters, for large"
+    " flights), hierarchical or global (COLMAP's); auto: incremental for small flights, parallel"
+    " for large ones.",
+)
+@click.option(
+    "--cluster-size",
+    type=click.IntRange(min=3),
+    help="Images of a cluster of parallel and hierarchical mapping.  [default: 150]",
+)
+@click.option(
+    "--threads", type=click.IntRange(min=1), help="Processors for mapping.  [default: all]"
+)
+@click.option(
+    "--memory",
+    type=click.FloatRange(min=0, min_open=True),
+    help="GiB that the workers of parallel mapping may take.  [default: 70 % of the machine's]",
 )
 @copy_option
 @rounds_options
@@ -235,6 +250,9 @@ def reconstruct(
     pairs: Path | None,
     output: Path | None,
     mapper: str,
+    cluster_size: int | None,
+    threads: int | None,
+    memory: float | None,
     copy: bool,
     rounds: int | None,
     budget: int | None,
@@ -270,7 +288,13 @@ def reconstruct(
     output = output or project.sparse
     if copy:
         project = working_copy(project)
-    options = ReconstructOptions(mapper, MappingOptions(seed=seed), MatchOptions(seed=seed))
+    mapping = MappingOptions(
+        seed=seed,
+        threads=threads,
+        cluster_size=cluster_size,
+        memory=None if memory is None else memory * 2**30,
+    )
+    options = ReconstructOptions(mapper, mapping, MatchOptions(seed=seed))
     if rounds is None:
         report = run(project, pairs, output, options)
     else:
@@ -483,6 +507,26 @@ def pairs(
     for line in summary(project, report):
         click.echo(line)
     finish_partial([f"Left out: {name} {reason}" for name, reason in report.ranking.left_out])
+
+
+@cli.command()
+@database_option
+@click.option(
+    "--graphml", type=FILE, help="Also write the graph for Gephi, yEd or Cytoscape (GraphML)."
+)
+def viewgraph(database: Path | None, graphml: Path | None) -> None:
+    """Show how well the verified pairs hold the flight together.
+
+    Components, images per pair, and the images and pairs whose loss splits the model. The
+    database stays as it is.
+    """
+    from colmap_netvlad.project import locate_database
+    from colmap_netvlad.viewgraph import read_view_graph, statistics_lines
+
+    graph = read_view_graph(locate_database(database))
+    if graphml is not None:
+        graph.write_graphml(graphml)
+    click.echo("\n".join(statistics_lines(graph.statistics())))
 
 
 @cli.command()

@@ -27,6 +27,9 @@ INLIER_SHARE = 0.5
 MIN_INLIERS = 15
 """An edge needs this many verified matches: COLMAP's mapper ignores pairs with fewer."""
 
+LISTED = 10
+"""Items of a list that are printed."""
+
 CACHED_IMAGES = 1024
 """Images whose keypoints are kept in memory while edges are weighed (64 KiB each, about)."""
 
@@ -156,6 +159,27 @@ class GraphStatistics:
     isolated: tuple[str, ...]
     bridges: tuple[tuple[str, str], ...]
     articulation_images: tuple[str, ...]
+
+
+def statistics_lines(statistics: GraphStatistics) -> list[str]:
+    """Return the figures as lines for the terminal."""
+    sizes = ", ".join(f"{size:,}" for size in statistics.component_sizes[:LISTED])
+    more = ", ..." if len(statistics.component_sizes) > LISTED else ""
+    lines = [
+        f"Images: {statistics.images:,}, verified pairs: {statistics.edges:,}.",
+        f"Pairs an image: {statistics.degree_min} to {statistics.degree_max}, "
+        f"median {statistics.degree_median:g}, mean {statistics.degree_mean:.1f}.",
+        f"Components: {len(statistics.component_sizes)} (images: {sizes}{more}).",
+    ]
+    for title, items in (
+        ("Images without a verified pair", statistics.isolated),
+        ("Images whose loss splits the model", statistics.articulation_images),
+        ("Pairs whose loss splits the model", [f"{a} {b}" for a, b in statistics.bridges]),
+    ):
+        if items:
+            more = ", ..." if len(items) > LISTED else ""
+            lines.append(f"{title}: {len(items):,}: {', '.join(items[:LISTED])}{more}.")
+    return lines
 
 
 def read_view_graph(

@@ -8,9 +8,11 @@ import networkx as nx
 import numpy as np
 import pycolmap
 import pytest
+from click.testing import CliRunner
 from hypothesis import given
 from hypothesis import strategies as st
 
+from colmap_netvlad.cli import cli
 from colmap_netvlad.database import pair_id
 from colmap_netvlad.errors import InputError
 from colmap_netvlad.viewgraph import ViewGraph, edge_weights, hull_area, read_view_graph
@@ -197,3 +199,22 @@ def test_graphml_keeps_names_and_weights(tmp_path: Path) -> None:
     assert read.edges["a", " "] == {
         "inliers": 20, "weight_inlier": 1.0, "weight_overlap": 1.0, "weight": 1.0,
     }  # fmt: skip
+
+
+def test_command_prints_where_the_model_splits_and_writes_graphml(tmp_path: Path) -> None:
+    chain = {(0, 1): [[k, k] for k in range(5)] * 3, (1, 2): [[k, k] for k in range(5)] * 3}
+    path = write_database(tmp_path / "database.db", [SQUARE] * 4, chain)
+    before = path.read_bytes()
+    graphml = tmp_path / "graph.graphml"
+    result = CliRunner().invoke(cli, ["viewgraph", "--db", str(path), "--graphml", str(graphml)])
+    assert result.exit_code == 0, result.output
+    assert result.stdout.splitlines() == [
+        "Images: 4, verified pairs: 2.",
+        "Pairs an image: 0 to 2, median 1, mean 1.0.",
+        "Components: 2 (images: 3, 1).",
+        "Images without a verified pair: 1: d.jpg.",
+        "Images whose loss splits the model: 1: b.jpg.",
+        "Pairs whose loss splits the model: 2: a.jpg b.jpg, b.jpg c.jpg.",
+    ]
+    assert nx.read_graphml(graphml).number_of_edges() == 2
+    assert path.read_bytes() == before

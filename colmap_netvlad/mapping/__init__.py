@@ -23,10 +23,10 @@ class Mapper(Protocol):
 
 
 MAPPERS: dict[str, Mapper] = {
-    "auto": map_automatic,
     "incremental": map_incremental,
     "parallel": map_parallel,
     "hierarchical": map_hierarchical,
     "global": map_global,
+    "auto": map_automatic,
 }
 """Name of `reconstruct --mapper` -> the mapper."""
