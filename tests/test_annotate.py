@@ -47,6 +47,13 @@ def _link(flight: Flight, scene: Path) -> None:
         os.link(flight.images / name, scene / "images" / name)
 
 
+def _carry(annotated: Path, scene: Path, output: Path) -> None:
+    """Write the flight's annotation as that of a copy of its photos, in `scene`."""
+    annotation = load_annotation(annotated / "village" / ANNOTATION)
+    carried = dataclasses.replace(annotation, name=scene.name, images=scene / "images")
+    save_annotation(carried, output / ANNOTATION)
+
+
 @pytest.fixture(scope="module")
 def annotated(
     dataset: Path, matched_database: Path, tmp_path_factory: pytest.TempPathFactory
@@ -128,7 +135,7 @@ def test_what_is_annotated_is_not_done_again_unless_photos_came(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     _link(flight, tmp_path / "data" / "village")
-    shutil.copytree(annotated / "village", tmp_path / "out" / "village")
+    _carry(annotated, tmp_path / "data" / "village", tmp_path / "out" / "village")
     options = AnnotateOptions(output=tmp_path / "out")
     made: list[str] = []
 
@@ -184,7 +191,7 @@ def test_a_scene_that_does_not_reconstruct_is_named_and_left_out(
     for number in range(4):
         photo = rng.integers(0, 255, (120, 160, 3)).astype(np.uint8)
         cv2.imwrite(str(data / "noise" / f"{number}.jpg"), photo)
-    shutil.copytree(annotated / "village", tmp_path / "out" / "village")
+    _carry(annotated, data / "village", tmp_path / "out" / "village")
     arguments = ["annotate", str(data), "--output", str(tmp_path / "out")]
     result = CliRunner().invoke(cli, arguments)
     assert result.exit_code == EXIT_PARTIAL, result.output
@@ -197,10 +204,7 @@ def test_equal_photos_in_two_scenes_are_found_by_content(
 ) -> None:
     for name in ("one", "two"):
         _link(flight, tmp_path / "data" / name)
-        scene = load_annotation(annotated / "village" / ANNOTATION)
-        images = tmp_path / "data" / name / "images"
-        renamed = dataclasses.replace(scene, name=name, images=images)
-        save_annotation(renamed, tmp_path / "out" / name / ANNOTATION)
+        _carry(annotated, tmp_path / "data" / name, tmp_path / "out" / name)
     report = annotate([tmp_path / "data"], AnnotateOptions(output=tmp_path / "out"))
     assert [scene.name for scene in report.scenes] == ["one"]
     assert "two is left out" in report.left_out[0] and "is also" in report.left_out[0]
@@ -231,6 +235,15 @@ def test_an_annotation_of_another_version_is_refused_and_left_alone(
     np.savez(path, **{**tables, "poses": tables["poses"][:3]})
     with pytest.raises(InputError, match="different lengths"):
         load_annotation(path)
+
+
+def test_an_annotation_of_other_photos_is_left_alone(
+    flight: Flight, annotated: Path, tmp_path: Path
+) -> None:
+    """Two datasets with a scene of one name, annotated into one folder."""
+    _link(flight, tmp_path / "other" / "village")
+    report = annotate([tmp_path / "other"], AnnotateOptions(output=annotated))
+    assert "the annotation of other photos" in report.left_out[0]
 
 
 def test_photos_that_are_gone_are_said(annotated: Path, tmp_path: Path) -> None:

@@ -122,7 +122,7 @@ def _die_after(monkeypatch: pytest.MonkeyPatch, steps: int) -> None:
         {},
         {"views": 2, "mining": "flight", "loss": "softmax", "keep_local": 0.5, "warm_up": 2},
         {"mining": "global", "loss": "triplet"},
-        {"aggregation": "gem", "pseudo_views": 6, "teacher": "start", "frozen": None},
+        {"aggregation": "gem", "pseudo_views": 4, "teacher": "start", "frozen": "block9"},
     ],
     ids=["new views", "kept features of flights", "global mining", "pseudo-scenes and teacher"],
 )
@@ -176,7 +176,19 @@ def test_a_run_trains_validates_and_leaves_a_model_that_runs(
 def test_training_lowers_the_loss(
     flights: list[Scene], options: TrainOptions, tmp_path: Path
 ) -> None:
-    options = change(options, views=1, frozen="block10", epochs=4, iterations=10, same_flight=1)
+    options = change(
+        options,
+        views=1,
+        frozen="block10",
+        mining="flight",
+        loss="softmax",
+        scenes_per_batch=3,
+        flight_photos=8,
+        epochs=3,
+        iterations=8,
+        learning_rate=1e-2,
+        checkpoint_every=100,
+    )
     history = train(flights, [], options, tmp_path / "run").history
     losses = [entry.loss for entry in history[1:]]
     assert losses[-1] < 0.8 * losses[0]

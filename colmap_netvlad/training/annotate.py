@@ -148,6 +148,10 @@ def annotate_scene(folder: SceneFolder, options: AnnotateOptions) -> Scene:
     photos = find_photos(folder.images)
     if path.exists():
         scene = load_annotation(path)
+        if scene.images.resolve() != folder.images.resolve():
+            raise InputError(
+                f"{path} is the annotation of other photos ({scene.images}); give another --output."
+            )
         if _is_current(scene, photos):
             return scene
     work = target if options.output else target / "annotation"
