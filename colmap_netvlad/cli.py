@@ -70,6 +70,12 @@ method_option = click.option(
     show_default=True,
     help="Retrieval method of --rounds; `colmap-netvlad methods` lists them.",
 )
+gps_option = click.option(
+    "--gps",
+    type=click.Choice(["auto", "off", "require"]),
+    help="Whether positions (priors or EXIF) re-weight the candidates.  [default: auto for hybrid,"
+    " off for the methods of the literature]",
+)
 copy_option = click.option(
     "--copy",
     is_flag=True,
@@ -471,6 +477,22 @@ def quoted(path: Path) -> str:
     help="Force exact or approximate (HNSW) search.  [default: by the number of images]",
 )
 @click.option("--vocab-tree", type=FILE, help="Vocabulary tree of the method bow.")
+@gps_option
+@click.option(
+    "--other-cameras",
+    type=float,
+    default=0.0,
+    show_default=True,
+    help="Least share of an image's partners that other cameras took, for mixed flights.",
+)
+@click.option(
+    "--sequential",
+    type=int,
+    default=0,
+    show_default=True,
+    help="Pair each photo with this many that follow it by name too (video, flight lines).",
+)
+@click.option("--join", "own_pairs", type=FILE, help="A pairs list of your own to join in.")
 @cache_option
 @device_option
 @seed_option
@@ -485,6 +507,10 @@ def pairs(
     output: Path | None,
     exact: bool | None,
     vocab_tree: Path | None,
+    gps: str | None,
+    other_cameras: float,
+    sequential: int,
+    own_pairs: Path | None,
     cache: Path | None,
     device: str | None,
     seed: int,
@@ -497,13 +523,15 @@ def pairs(
     from colmap_netvlad.models.catalogue import DEFAULT
     from colmap_netvlad.project import find_project
     from colmap_netvlad.retrieval.methods import RetrievalOptions
+    from colmap_netvlad.retrieval.partners import PartnerRules
     from colmap_netvlad.retrieval.run import make_pairs, summary
 
     project = find_project(database, images, cache)
     options = RetrievalOptions(
-        k=k, model=model, device=device, seed=seed, vocab_tree=vocab_tree, exact=exact
+        k=k, model=model, device=device, seed=seed, vocab_tree=vocab_tree, exact=exact, gps=gps
     )
-    report = make_pairs(project, method or DEFAULT, options, format, output)
+    rules = PartnerRules(other_cameras, sequential, own_pairs)
+    report = make_pairs(project, method or DEFAULT, options, format, output, rules)
     for line in summary(project, report):
         click.echo(line)
     finish_partial([f"Left out: {name} {reason}" for name, reason in report.ranking.left_out])

@@ -7,7 +7,8 @@ import pytest
 from scipy import sparse
 
 from colmap_netvlad.positions import Positions
-from colmap_netvlad.retrieval.gps import NEUTRAL, add_nearness
+from colmap_netvlad.retrieval.gps import NEUTRAL, add_nearness, near_first
+from colmap_netvlad.retrieval.ranking import NO_PARTNER, from_lists
 
 
 def on_a_line(*x: float) -> Positions:
@@ -51,3 +52,21 @@ def test_without_positions_nothing_changes_in_the_order() -> None:
     similarity = sparse.csr_array(np.array([[0, 2, 1], [2, 0, 3], [1, 3, 0]], float))
     scores = add_nearness(similarity, positions, 1, 1.0).toarray()
     assert scores == pytest.approx(similarity.toarray() + NEUTRAL * (1 - np.eye(3)))
+
+
+def test_near_first_keeps_those_left_out_without_partners() -> None:
+    ranking = from_lists(
+        ("a", "b", "c", "d"),
+        [[(1, 0.2), (2, 0.9)], [(0, 0.2), (2, 0.1)], [(0, 0.9), (1, 0.1)], []],
+        "deep",
+        left_out=(("d", "is empty"),),
+    )
+    nearer = near_first(ranking, on_a_line(0, 1, 900, 2), 1)
+    assert nearer.partners.tolist() == [[1], [0], [0], [NO_PARTNER]]
+    assert "positions of 3 of 4 photos used" in nearer.notes
+
+
+def test_useless_positions_only_cut_the_ranking() -> None:
+    ranking = from_lists(("a", "b", "c"), [[(2, 2.0), (1, 1.0)], [(0, 1.0)], [(0, 1.0)]], "deep")
+    nearer = near_first(ranking, on_a_line(np.nan, np.nan, np.nan), 1)
+    assert nearer.partners.tolist() == [[2], [0], [0]]

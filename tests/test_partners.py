@@ -84,4 +84,3 @@ def test_the_user_s_pairs_are_joined_in_once_and_in_order() -> None:
     pairs = [ImagePair("a", "c", 0.5, 1)]
     joined = join_pairs(pairs, [("c", "a"), ("c", "b"), ("b", "b")], names)
     assert joined == [ImagePair("a", "c", 0.5, 1), ImagePair("b", "c", 0.0, 0)]
-    assert join_pairs(pairs, [("b", "c")], names, [frozenset("bc")]) == pairs

@@ -7,12 +7,17 @@ heights still pair.
 
 from __future__ import annotations
 
+import time
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 from scipy.spatial import cKDTree
 
 from colmap_netvlad.positions import Positions
+from colmap_netvlad.retrieval.fusion import ranking_of, similarity_matrix
+from colmap_netvlad.retrieval.ranking import Ranking
 
 NEUTRAL = 0.5
 """Nearness of a pair of which a position is unknown: it neither gains nor loses."""
@@ -21,15 +26,53 @@ REACH = 2.0
 """A pair's nearness is one half-width at this many times the distance to the k-th neighbour."""
 
 
+SPACING_NEIGHBOURS = 10
+"""The neighbour whose distance measures how dense the flight is around a photo."""
+
+WEIGHT = 4.0
+"""Weight of nearness beside a ranking's similarity, chosen on the training flights
+(`scripts/fit_hybrid.py`)."""
+
+
+def near_first(ranking: Ranking, positions: Positions, k: int) -> Ranking:
+    """Return each image's `k` best partners of a deeper ranking, nearness added.
+
+    Photos without a position are ranked by appearance as before; where no positions are useful
+    the ranking is only cut. The positions' notes join the ranking's.
+    """
+    if not positions.useful:
+        return replace(ranking.top(k), notes=(*ranking.notes, *positions.notes))
+    start = time.perf_counter()
+    positions = _without(positions, ranking)
+    similarity = add_nearness(similarity_matrix(ranking), positions, SPACING_NEIGHBOURS, WEIGHT)
+    nearer = ranking_of(similarity, ranking.names, ranking.method, k)
+    used = f"positions of {int(positions.known.sum())} of {len(ranking.names)} photos used"
+    return replace(
+        ranking,
+        partners=nearer.partners,
+        scores=nearer.scores,
+        seconds_search=ranking.seconds_search + time.perf_counter() - start,
+        notes=(*ranking.notes, used, *positions.notes),
+    )
+
+
+def _without(positions: Positions, ranking: Ranking) -> Positions:
+    """Forget the positions of images left out, so that nearness gives them no partners."""
+    left_out = {name for name, _ in ranking.left_out}
+    metres = positions.metres.copy()
+    metres[[name in left_out for name in ranking.names]] = np.nan
+    return replace(positions, metres=metres)
+
+
 def add_nearness(
     similarity: sparse.csr_array, positions: Positions, k: int, weight: float
 ) -> sparse.csr_array:
     """Return the similarity plus `weight` times the nearness of each pair, 0..1.
 
     Nearness is exp(-d^2 / 2 s^2): d is the horizontal distance and s is `REACH` times the
-    geometric mean of the two photos' distances to their k-th nearest photo, so that dense and sparse parts of a
-    flight, and a fast and a slow flight, are each measured by their own spacing. Each photo's k
-    nearest on the ground become candidates too.
+    geometric mean of the two photos' distances to their k-th nearest photo, so that dense and
+    sparse parts of a flight, and a fast and a slow flight, are each measured by their own
+    spacing. Each photo's k nearest on the ground become candidates too.
 
     Args:
         similarity: (N, N) symmetric sparse similarity.

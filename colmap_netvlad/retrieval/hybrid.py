@@ -1,4 +1,4 @@
-"""Deep features and SIFT together: fused, expanded, and nearer photos first where GPS says so."""
+"""Deep features and SIFT together: rankings fused, with query expansion."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from colmap_netvlad.retrieval.ranking import Ranking
 if TYPE_CHECKING:
     from colmap_netvlad.retrieval.methods import RetrievalOptions
 
-DEEP_WEIGHT = 1.0
+DEEP_WEIGHT = 0.7
 VLAD_WEIGHT = 1.0
 """Shares of the two rankings, chosen on the training flights (`scripts/fit_hybrid.py`)."""
 

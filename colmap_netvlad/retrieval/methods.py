@@ -11,8 +11,11 @@ from colmap_netvlad.database import image_names
 from colmap_netvlad.errors import InputError
 from colmap_netvlad.models.catalogue import CATALOGUE
 from colmap_netvlad.pairs import check_k
+from colmap_netvlad.positions import Positions, read_positions
 from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval import baselines, bow, deep, hybrid, spatial, vlad
+from colmap_netvlad.retrieval.gps import near_first
+from colmap_netvlad.retrieval.hybrid import fusion_depth
 from colmap_netvlad.retrieval.ranking import Ranking
 
 CHECKPOINT_SUFFIXES = (".safetensors", ".mat")
@@ -30,6 +33,8 @@ class RetrievalOptions:
         batch_size: photos described at once; None: the method's own.
         vocab_tree: the vocabulary tree of `bow`; None: see `bow.find_tree`.
         exact: True or False forces exact search or HNSW; None: see `search.EXACT_UP_TO`.
+        gps: whether positions re-weight the candidates, one of `GPS_MODES`; None: "auto" for
+            methods that are not from the literature, else "off".
     """
 
     k: int = 30
@@ -39,6 +44,11 @@ class RetrievalOptions:
     batch_size: int | None = None
     vocab_tree: Path | None = None
     exact: bool | None = None
+    gps: str | None = None
+
+
+GPS_MODES = ("auto", "off", "require")
+"""Use positions where there are useful ones, never, or fail where there are none."""
 
 
 @dataclass(frozen=True)
@@ -49,13 +59,15 @@ class Method:
         name: what users call it.
         summary: one line with its source.
         needs: of "photos", "features", "positions".
-        rank: ranks the images of a project.
+        rank: ranks the images of a project by appearance (or, for `spatial`, by position).
+        gps: whether positions join in by themselves.
     """
 
     name: str
     summary: str
     needs: frozenset[str]
     rank: Callable[[Project, RetrievalOptions], Ranking]
+    gps: bool = False
 
 
 def _deep_method(name: str, summary: str, checkpoint: str | Path) -> Method:
@@ -83,9 +95,11 @@ METHODS: dict[str, Method] = {
         ),
         Method(
             "hybrid",
-            "The default deep model and VLAD added up, with query expansion: ours.",
+            "The default deep model, VLAD and, where there is any, GPS added up, with query"
+            " expansion: ours.",
             frozenset({"photos", "features"}),
             hybrid.rank,
+            gps=True,
         ),
         Method(
             "spatial",
@@ -136,8 +150,34 @@ def rank(project: Project, name: str | Path, options: RetrievalOptions | None = 
     method = find_method(name if str(name) == "hybrid" else options.model or name)
     count = len(image_names(project.database))
     k = check_k(options.k, count)
-    ranking = method.rank(project, replace(options, k=k))
+    positions = _positions(project, method, options)
+    if positions is None:
+        ranking = method.rank(project, replace(options, k=k))
+    else:
+        deep_enough = replace(options, k=fusion_depth(k))
+        ranking = near_first(method.rank(project, deep_enough), positions, k)
     if k < options.k:
         note = f"k lowered from {options.k} to {k}: the project has {count} images"
         ranking = replace(ranking, notes=(*ranking.notes, note))
     return ranking
+
+
+def _positions(project: Project, method: Method, options: RetrievalOptions) -> Positions | None:
+    """Return the positions that are to re-weight a method's candidates, or None.
+
+    Raises:
+        InputError: no such mode, or positions are required and there are no useful ones.
+    """
+    mode = options.gps or ("auto" if method.gps else "off")
+    if mode not in GPS_MODES:
+        raise InputError(f"There is no --gps {mode}; choose {', '.join(GPS_MODES)}.")
+    if mode == "off" or "positions" in method.needs:
+        return None
+    positions = read_positions(project)
+    if mode == "require" and not positions.useful:
+        why = f" {positions.notes[-1]}" if positions.notes else ""
+        raise InputError(
+            f"Positions are required, but neither {project.database} nor the photos' EXIF have "
+            f"any that tell photos apart.{why} Use --gps auto or off."
+        )
+    return positions if positions.useful or positions.notes else None

@@ -7,15 +7,38 @@ add pairs to a list, for input of which the user knows more.
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from math import ceil
-from pathlib import PurePosixPath
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 
+from colmap_netvlad.errors import InputError
 from colmap_netvlad.pairs import ImagePair
 from colmap_netvlad.retrieval.ranking import NO_PARTNER, Ranking
+
+
+@dataclass(frozen=True)
+class PartnerRules:
+    """What the user knows beside what the photos look like.
+
+    Attributes:
+        other_cameras: least share of an image's partners that other cameras took, 0..1.
+        sequential: neighbours in the order of the names that become pairs as well.
+        own_pairs: a pairs list of the user's own, joined in.
+    """
+
+    other_cameras: float = 0.0
+    sequential: int = 0
+    own_pairs: Path | None = None
+
+    def check(self) -> None:
+        """Raise InputError where a value cannot be meant."""
+        if not 0 <= self.other_cameras <= 1:
+            raise InputError(f"--other-cameras is {self.other_cameras}; it is a share, 0 to 1.")
+        if self.sequential < 0:
+            raise InputError(f"--sequential is {self.sequential}; it must be at least 0.")
 
 
 def without_same_frame(ranking: Ranking, frames: Sequence[int | None]) -> Ranking:
@@ -77,7 +100,6 @@ def join_pairs(
     pairs: Sequence[ImagePair],
     extra: Iterable[tuple[str, str]],
     names: Sequence[str],
-    left_out: Collection[frozenset[str]] = (),
 ) -> list[ImagePair]:
     """Return the pairs with `extra` ones joined in, each once, in the order of `names`.
 
@@ -87,7 +109,7 @@ def join_pairs(
     joined = {frozenset((pair.name1, pair.name2)): pair for pair in pairs}
     for a, b in extra:
         key = frozenset((a, b))
-        if len(key) == 2 and key not in left_out and key not in joined:
+        if len(key) == 2 and key not in joined:
             first, second = sorted((a, b), key=place.__getitem__)
             joined[key] = ImagePair(first, second, 0.0, 0)
     return sorted(joined.values(), key=lambda pair: (place[pair.name1], place[pair.name2]))

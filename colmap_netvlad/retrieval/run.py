@@ -3,19 +3,36 @@
 from __future__ import annotations
 
 import shlex
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from colmap_netvlad.connect import components
-from colmap_netvlad.database import image_names
+from colmap_netvlad.database import image_names, open_database
 from colmap_netvlad.errors import InputError
 from colmap_netvlad.models.catalogue import DEFAULT
-from colmap_netvlad.pairs import FORMATS, ImagePair, check_k, union_of_top, write_pairs
+from colmap_netvlad.pairs import (
+    FORMATS,
+    ImagePair,
+    check_k,
+    read_pairs,
+    union_of_top,
+    write_pairs,
+)
 from colmap_netvlad.project import Project
+from colmap_netvlad.retrieval.hybrid import fusion_depth
 from colmap_netvlad.retrieval.methods import RetrievalOptions, rank
+from colmap_netvlad.retrieval.partners import (
+    PartnerRules,
+    join_pairs,
+    sequential_pairs,
+    with_camera_quota,
+    without_same_frame,
+)
 from colmap_netvlad.retrieval.ranking import Ranking
 from colmap_netvlad.retrieval.store import Store
 
+NO_RULES = PartnerRules()
 SUFFIXES = {"colmap": ".txt", "csv": ".csv", "json": ".json"}
 
 
@@ -47,6 +64,7 @@ def make_pairs(
     options: RetrievalOptions | None = None,
     format: str = "colmap",
     output: Path | None = None,
+    rules: PartnerRules = NO_RULES,
 ) -> PairsReport:
     """Retrieve each image's k nearest partners and write the union as a pairs list.
 
@@ -61,6 +79,8 @@ def make_pairs(
         output: the pairs list; default `pairs.txt` (.csv, .json) beside the database. Names that
             COLMAP's list cannot express (spaces, a leading #) make a second, complete list:
             the same name ending in .csv.
+        rules: cameras, sequences and pairs the user knows of; photos of one rig frame are never
+            paired.
 
     Raises:
         InputError: anything in the input a user can mend.
@@ -70,11 +90,11 @@ def make_pairs(
         raise InputError(f"There is no format {format!r}; formats are {', '.join(FORMATS)}.")
     output = output or project.pairs.with_suffix(SUFFIXES[format])
     _protect(output, project)
-    k = check_k(options.k, len(image_names(project.database)))
-    ranking = rank(project, method, options)
-    if ranking.method != "exhaustive":
-        ranking = ranking.top(k)
-    pairs = union_of_top(ranking, ranking.depth)
+    rules.check()
+    names = image_names(project.database)
+    extra = _extra_pairs(names, rules)
+    ranking = _rank_by_rules(project, method, options, rules)
+    pairs = join_pairs(union_of_top(ranking, ranking.depth), extra, names)
     _remember(project, ranking)
     unwritable = write_pairs(output, pairs, format)
     colmap_list = None
@@ -82,6 +102,33 @@ def make_pairs(
         colmap_list, output = output, output.with_suffix(".csv")
         write_pairs(output, pairs, "csv")
     return PairsReport(ranking, pairs, _components(ranking, pairs), output, colmap_list, unwritable)
+
+
+def _rank_by_rules(
+    project: Project, method: str, options: RetrievalOptions, rules: PartnerRules
+) -> Ranking:
+    """Rank, and choose each image's k partners with regard to rig frames and cameras."""
+    with open_database(project.database) as database:
+        images = database.images()
+        frames = database.frames()
+    k = check_k(options.k, len(images))
+    is_rig = len(set(frames.values())) < len(frames)
+    if not is_rig and not rules.other_cameras:
+        ranking = rank(project, method, options)
+        return ranking if ranking.method == "exhaustive" else ranking.top(k)
+    # What the rules take out must be replaced from further down.
+    ranking = rank(project, method, replace(options, k=min(fusion_depth(k), len(images) - 1)))
+    if is_rig:
+        ranking = without_same_frame(ranking, [frames.get(image.image_id) for image in images])
+    cameras = [image.camera_id for image in images]
+    return with_camera_quota(ranking, cameras, k, rules.other_cameras)
+
+
+def _extra_pairs(names: Sequence[str], rules: PartnerRules) -> list[tuple[str, str]]:
+    extra = sequential_pairs(names, rules.sequential)
+    if rules.own_pairs is not None:
+        extra += read_pairs(rules.own_pairs, names)
+    return extra
 
 
 MOST_LISTED = 10
