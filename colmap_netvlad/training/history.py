@@ -75,7 +75,7 @@ def write_history(folder: Path, history: Sequence[Epoch]) -> None:
         folder / "history.json", json.dumps([entry.as_dict() for entry in history], indent=1)
     )
     write_atomically(folder / "history.csv", _table(history))
-    _draw(folder / "curves.png", history)
+    draw_curves(folder / "curves.png", history)
 
 
 def _table(history: Sequence[Epoch]) -> str:
@@ -93,7 +93,8 @@ def _table(history: Sequence[Epoch]) -> str:
     return out.getvalue()
 
 
-def _draw(path: Path, history: Sequence[Epoch]) -> None:
+def draw_curves(path: Path, history: Sequence[Epoch]) -> None:
+    """Draw loss and mAP over the epochs into a PNG file."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
