@@ -9,6 +9,7 @@ import numpy as np
 
 from colmap_netvlad import metrics
 from colmap_netvlad.compare.evidence import Evidence, Plan
+from colmap_netvlad.compare.finds import single_finds
 from colmap_netvlad.compare.result import (
     Comparison,
     MethodResult,
@@ -16,7 +17,6 @@ from colmap_netvlad.compare.result import (
     RetrievalFigures,
 )
 from colmap_netvlad.metrics import as_pair
-from colmap_netvlad.report.examples import single_finds
 
 NOISE = {"netvlad-o": 6.0, "bow": 14.0, "vlad": 25.0}
 """How far a method's idea of a photo's place is off, m; lines are 20 m apart."""

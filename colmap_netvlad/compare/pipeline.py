@@ -2,28 +2,24 @@
 
 from __future__ import annotations
 
-import math
-import platform
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import numpy as np
-import pycolmap
-from scipy import sparse
-
-from colmap_netvlad import __version__, engine, metrics, progress
+from colmap_netvlad import metrics, progress
 from colmap_netvlad.compare import pool
 from colmap_netvlad.compare.evidence import Evidence
-from colmap_netvlad.compare.models import read_plan, reconstruct_once
+from colmap_netvlad.compare.figures import (
+    FULL_RANKING,
+    Candidate,
+    compute_figures,
+    gather_evidence,
+)
+from colmap_netvlad.compare.models import reconstruct_once
 from colmap_netvlad.compare.result import (
-    EXHAUSTIVE,
-    UNION,
     Comparison,
-    MethodResult,
     ModelFigures,
-    RetrievalFigures,
     write_json,
 )
 from colmap_netvlad.compare.workspace import ProjectFacts, Workspace, open_workspace, read_facts
@@ -33,15 +29,9 @@ from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.matching import MatchOptions
 from colmap_netvlad.metrics import Pair, as_pair
 from colmap_netvlad.pairs import check_k, union_of_top
-from colmap_netvlad.positions import read_positions
 from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval import deep
 from colmap_netvlad.retrieval.methods import Method, RetrievalOptions, find_method, rank
-from colmap_netvlad.retrieval.ranking import Ranking
-
-FULL_RANKING = 1000
-"""Up to this many images every method ranks all others, so that average precision is the
-textbook's; search is exact there, and the first k are the same as if k were asked for."""
 
 ASK_ABOVE = 600.0
 """Exhaustive matching that is estimated to take longer than this, s, is asked about first."""
@@ -75,23 +65,6 @@ class CompareOptions:
     seed: int = 0
     matching: MatchOptions = field(default_factory=MatchOptions)
     mapping: MappingOptions = field(default_factory=MappingOptions)
-
-
-@dataclass
-class _Candidate:
-    """One method under comparison: what it is called, and what is known of it so far."""
-
-    text: str
-    name: str
-    summary: str
-    ranking: Ranking | None = None
-    timed_earlier: bool = False
-    failed: str | None = None
-    model: ModelFigures | None = None
-
-    @property
-    def ranks(self) -> bool:
-        return self.name != EXHAUSTIVE
 
 
 def compare(
@@ -138,8 +111,10 @@ def compare(
         for candidate in candidates:
             if candidate.ranking:
                 _map(candidate, workspace, project.images, pairs[k][candidate.name], k, options)
-    evidence = _evidence(project, workspace, facts, candidates, pairs[ks[-1]])
-    comparison = _figures(project, workspace, facts, candidates, pairs, evidence, options.seed)
+    evidence = gather_evidence(project, workspace, facts, candidates, pairs[ks[-1]])
+    comparison = compute_figures(
+        project, workspace, facts, candidates, pairs, evidence, options.seed
+    )
     write_report(workspace, comparison, evidence)
     return comparison, workspace
 
@@ -191,15 +166,15 @@ def _stable_text(text: str) -> str:
     return str(Path(text).resolve()) if Path(text).is_file() else text
 
 
-def _candidates(texts: Sequence[str]) -> list[_Candidate]:
+def _candidates(texts: Sequence[str]) -> list[Candidate]:
     """Find all methods, also of earlier runs: one that has gone since is a failed one."""
-    candidates: list[_Candidate] = []
+    candidates: list[Candidate] = []
     for text in texts:
         try:
             method = find_method(text)
-            candidate = _Candidate(text, method.name, method.summary)
+            candidate = Candidate(text, method.name, method.summary)
         except InputError as fault:
-            candidate = _Candidate(text, Path(text).stem, "", failed=fault.message)
+            candidate = Candidate(text, Path(text).stem, "", failed=fault.message)
         if candidate.name in {other.name for other in candidates}:
             candidate.name = text
         candidates.append(candidate)
@@ -226,7 +201,7 @@ def _check_cost(
 
 
 def _rank(
-    candidate: _Candidate,
+    candidate: Candidate,
     project: Project,
     workspace: Workspace,
     facts: ProjectFacts,
@@ -263,7 +238,7 @@ def _ranking_key(text: str, method: Method, options: RetrievalOptions) -> str:
     return key
 
 
-def _pairs(candidate: _Candidate, k: int) -> set[Pair]:
+def _pairs(candidate: Candidate, k: int) -> set[Pair]:
     assert candidate.ranking is not None
     depth = k if candidate.ranks else candidate.ranking.depth
     return {as_pair(p.name1, p.name2) for p in union_of_top(candidate.ranking, depth)}
@@ -280,7 +255,7 @@ def _say_matched(pairs: Mapping[str, set[Pair]], now: int) -> None:
 
 
 def _map(
-    candidate: _Candidate,
+    candidate: Candidate,
     workspace: Workspace,
     images: Path | None,
     pairs: set[Pair],
@@ -294,141 +269,6 @@ def _map(
         candidate.model = reconstruct_once(workspace.union, images, folder, pairs, k, mapping)
     except Exception as fault:  # whatever stops one method leaves the others
         candidate.model = ModelFigures(k, failed=_reason(fault))
-
-
-def _evidence(
-    project: Project,
-    workspace: Workspace,
-    facts: ProjectFacts,
-    candidates: Sequence[_Candidate],
-    pairs: Mapping[str, set[Pair]],
-) -> Evidence:
-    everything = metrics.verified_by_name(workspace.union)
-    if EXHAUSTIVE in pairs:
-        verified = everything
-    else:
-        # Pairs only the cost of exhaustive matching was measured on belong to no method.
-        wanted = set().union(*pairs.values())
-        verified = {pair: count for pair, count in everything.items() if pair in wanted}
-    plans = {
-        c.name: read_plan(workspace.model_folder(c.name))
-        for c in candidates
-        if c.model and not c.model.failed
-    }
-    return Evidence(
-        names=facts.names,
-        images=project.images,
-        partners={c.name: c.ranking.partners for c in candidates if c.ranking and c.ranks},
-        pairs=pairs,
-        verified=verified,
-        truth=metrics.correct_pairs(verified),
-        positions=read_positions(project).metres,
-        plans={name: plan for name, plan in plans.items() if plan is not None},
-    )
-
-
-def _figures(
-    project: Project,
-    workspace: Workspace,
-    facts: ProjectFacts,
-    candidates: Sequence[_Candidate],
-    pairs: Mapping[int, Mapping[str, set[Pair]]],
-    evidence: Evidence,
-    seed: int,
-) -> Comparison:
-    ks = tuple(sorted(pairs))
-    widest = pairs[ks[-1]]
-    seconds = workspace.pair_seconds()
-    reference = EXHAUSTIVE if EXHAUSTIVE in widest else UNION
-    full = reference == EXHAUSTIVE and len(facts.names) <= FULL_RANKING
-    depth = len(facts.names) - 1 if full else ks[-1]
-    found = _single_finds(evidence)
-    methods = []
-    for candidate in candidates:
-        result = MethodResult(candidate.name, candidate.summary, failed=candidate.failed)
-        ranking = candidate.ranking
-        if ranking is not None:
-            seconds_match, share = pool.seconds_of(widest[candidate.name], seconds)
-            precision = metrics.mean_average_precision(ranking.top(depth), evidence.truth)
-            result = replace(
-                result,
-                notes=(*ranking.notes, *_left_out(ranking)),
-                seconds_describe=ranking.seconds_describe if candidate.ranks else None,
-                seconds_search=ranking.seconds_search if candidate.ranks else None,
-                timed_earlier=candidate.timed_earlier,
-                seconds_match=seconds_match,
-                match_measured=share,
-                mean_average_precision=_number(precision) if candidate.ranks else None,
-                only_here=found.get(candidate.name, 0),
-                at_k=tuple(_at_k(pairs[k][candidate.name], k, evidence) for k in ks),
-                model=candidate.model,
-            )
-        methods.append(result)
-    return Comparison(
-        project=project.database.name,
-        images=len(facts.names),
-        images_without_features=sum(count == 0 for count in facts.keypoints),
-        keypoints=sum(facts.keypoints),
-        ks=ks,
-        seed=seed,
-        reference=reference,
-        reference_pairs=len(evidence.truth),
-        precision_depth=depth,
-        pairs_matched=len(set().union(*widest.values())),
-        pairs_requested=sum(map(len, widest.values())),
-        seconds_matched=pool.seconds_of(set().union(*widest.values()), seconds)[0] or 0.0,
-        versions=_versions(),
-        methods=tuple(methods),
-    )
-
-
-def _at_k(pairs: set[Pair], k: int, evidence: Evidence) -> RetrievalFigures:
-    correct = pairs & evidence.truth
-    sizes = _component_sizes(evidence.names, correct)
-    return RetrievalFigures(
-        k=k,
-        pairs=len(pairs),
-        correct=len(correct),
-        accuracy=_number(metrics.accuracy(pairs, evidence.verified)),
-        recall=_number(metrics.recall(pairs, evidence.truth)),
-        components=len(sizes),
-        largest_component=max(sizes),
-    )
-
-
-def _component_sizes(names: Sequence[str], pairs: set[Pair]) -> list[int]:
-    index = {name: i for i, name in enumerate(names)}
-    ends = np.array([(index[a], index[b]) for a, b in sorted(pairs)], np.int64).reshape(-1, 2)
-    shape = (len(names), len(names))
-    graph = sparse.coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=shape)
-    _, labels = sparse.csgraph.connected_components(graph, directed=False)
-    return np.bincount(labels).tolist()
-
-
-def _single_finds(evidence: Evidence) -> dict[str, int]:
-    from colmap_netvlad.report.examples import single_finds
-
-    return {name: len(finds) for name, finds in single_finds(evidence).items()}
-
-
-def _left_out(ranking: Ranking) -> list[str]:
-    if not ranking.left_out:
-        return []
-    name, reason = ranking.left_out[0]
-    count = len(ranking.left_out)
-    return [f"{count} image{'s' if count > 1 else ''} left out (first: {name}: {reason})"]
-
-
-def _versions() -> dict[str, str]:
-    return {
-        "colmap-netvlad": __version__,
-        "pycolmap": pycolmap.__version__,
-        "Processor": f"{platform.machine()}, {engine.usable_processors()} cores",
-    }
-
-
-def _number(value: float) -> float | None:
-    return None if math.isnan(value) else value
 
 
 def _reason(fault: Exception) -> str:

@@ -17,6 +17,9 @@ FORMAT = 1
 EXHAUSTIVE = "exhaustive"
 """The method that asks for every pair: where it ran, its verified pairs are the truth."""
 
+CHANCE = "random"
+"""The method that draws by chance: the floor under all others."""
+
 UNION = "union"
 """Without it, the verified pairs of all methods together stand for the truth."""
 
@@ -83,7 +86,7 @@ class MethodResult:
             run was killed before it could write the time down) count as the mean of the rest.
         mean_average_precision: of its lists down to `Comparison.precision_depth`, 0..1; None for
             a method that does not rank.
-        only_here: correct pairs that no other method (the exhaustive one apart) retrieved.
+        only_here: correct pairs that no other method (exhaustive and random apart) retrieved.
         at_k: retrieval figures, ascending in k.
         model: the reconstruction, or None where there was to be none.
     """
@@ -111,6 +114,11 @@ class MethodResult:
     def ranks(self) -> bool:
         """Whether it orders partners (the exhaustive method asks for all of them)."""
         return self.name != EXHAUSTIVE
+
+    @property
+    def competes(self) -> bool:
+        """Whether it can be best: chance is the floor, and the exhaustive method the ceiling."""
+        return self.name not in (EXHAUSTIVE, CHANCE)
 
 
 @dataclass(frozen=True)

@@ -11,10 +11,13 @@ from rich.table import Table
 
 from colmap_netvlad.compare.result import EXHAUSTIVE, Comparison, MethodResult
 from colmap_netvlad.files import write_atomically
-from colmap_netvlad.report.measures import MEASURES, shown
+from colmap_netvlad.report.measures import MEASURES, NOT_RUNNING, shown
 
 BEST = "*"
 """Marks the best of a row."""
+
+WIDEST = 1000
+"""Characters of the widest table."""
 
 RETRIEVAL_COLUMNS = (
     "pairs", "correct", "accuracy", "recall", "components", "largest_component",
@@ -26,7 +29,7 @@ def summary_table(comparison: Comparison) -> Table:
     table = Table(
         title=f"{comparison.project}: {comparison.images:,} images, k = {comparison.k}",
         title_justify="left",
-        caption=f"{BEST} best of the row. {reference_sentence(comparison)}",
+        caption=f"{BEST} best of the row ({NOT_RUNNING}). {reference_sentence(comparison)}",
         caption_justify="left",
     )
     table.add_column("")
@@ -48,7 +51,7 @@ def print_comparison(comparison: Comparison, console: Console | None = None) -> 
     """Print the summary on standard output, whole also where the terminal is narrow."""
     console = console or Console()
     table = summary_table(comparison)
-    needed = console.measure(table).maximum
+    needed = Console(width=WIDEST).measure(table).maximum
     if needed > console.width:
         console = Console(file=console.file, width=needed, force_terminal=console.is_terminal)
     console.print(table)

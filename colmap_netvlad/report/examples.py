@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_netvlad.compare.evidence import Evidence
-from colmap_netvlad.compare.result import EXHAUSTIVE
+from colmap_netvlad.compare.result import CHANCE
 from colmap_netvlad.metrics import CORRECT_MATCHES, Pair, as_pair
 from colmap_netvlad.retrieval.ranking import NO_PARTNER
 
@@ -54,14 +54,6 @@ class Example:
 
 
 @dataclass(frozen=True)
-class Find:
-    """A correct pair that one method alone retrieved."""
-
-    pair: Pair
-    matches: int
-
-
-@dataclass(frozen=True)
 class HardImage:
     """An image with few verified partners.
 
@@ -80,10 +72,10 @@ def choose_examples(evidence: Evidence, queries: int = QUERIES) -> list[Example]
     """Choose the queries on which the methods differ most in correct partners.
 
     A query that is a true partner of one already chosen is passed over, as it would show the
-    same place again. With one method, or where all agree, the queries with the fewest correct
-    partners come first.
+    same place again. Chance is shown but has no say. With one method, or where all agree, the
+    queries with the fewest correct partners come first.
     """
-    methods = list(evidence.partners)
+    methods = [name for name in evidence.partners if name != CHANCE] or list(evidence.partners)
     if not methods or not evidence.truth:
         return []
     hits = np.array([_hits(evidence, method) for method in methods])  # (methods, N)
@@ -104,26 +96,6 @@ def choose_examples(evidence: Evidence, queries: int = QUERIES) -> list[Example]
         Example(evidence.names[i], _reason(methods, hits[:, i], spread[i]), _rows(evidence, i))
         for i in chosen
     ]
-
-
-def single_finds(evidence: Evidence) -> dict[str, list[Find]]:
-    """Return by method the correct pairs that no other method retrieved, strongest first.
-
-    The exhaustive reference retrieves everything and does not count.
-    """
-    methods = [name for name in evidence.pairs if name != EXHAUSTIVE]
-    asked = Counter(pair for method in methods for pair in evidence.pairs[method])
-    return {
-        method: sorted(
-            (
-                Find(pair, evidence.verified[pair])
-                for pair in evidence.pairs[method]
-                if asked[pair] == 1 and evidence.verified.get(pair, 0) > CORRECT_MATCHES
-            ),
-            key=lambda find: (-find.matches, find.pair),
-        )
-        for method in methods
-    }
 
 
 def hardest_images(evidence: Evidence, count: int = HARDEST) -> list[HardImage]:

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 from colmap_netvlad.compare.result import Comparison, MethodResult, ModelFigures, RetrievalFigures
 
+NOT_RUNNING = "exhaustive and random are not in the running"
+
 MISSING = "–"
 """Stands where a method has no such figure."""
 
@@ -41,9 +43,10 @@ class Measure:
     def best(self, methods: Sequence[MethodResult]) -> set[str]:
         """Return the names of the methods that are best, as far as the shown digits tell.
 
-        The exhaustive reference is not in the running; where all are equal none is best.
+        The exhaustive reference and the floor of chance are not in the running; where all are
+        equal none is best.
         """
-        values = {m.name: self.value(m) for m in methods if m.ranks and not m.failed}
+        values = {m.name: self.value(m) for m in methods if m.competes and not m.failed}
         known = {name: value for name, value in values.items() if value is not None}
         if not self.better or len(known) < 2:
             return set()
@@ -86,7 +89,8 @@ def _efficiency(method: MethodResult) -> float | None:
 
 
 def _total(method: MethodResult) -> float | None:
-    spent = (_efficiency(method), method.seconds_match, _of_model(lambda m: m.seconds)(method))
+    retrieval = _efficiency(method) if method.ranks else 0.0
+    spent = (retrieval, method.seconds_match, _of_model(lambda m: m.seconds)(method))
     return None if None in spent else sum(part for part in spent if part is not None)
 
 

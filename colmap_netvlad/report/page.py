@@ -11,6 +11,8 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from colmap_netvlad.compare.evidence import Evidence
+from colmap_netvlad.compare.figures import FULL_RANKING
+from colmap_netvlad.compare.finds import single_finds
 from colmap_netvlad.compare.result import Comparison
 from colmap_netvlad.metrics import CORRECT_MATCHES, Pair
 from colmap_netvlad.report import plots
@@ -20,10 +22,9 @@ from colmap_netvlad.report.examples import (
     PARTNERS,
     choose_examples,
     hardest_images,
-    single_finds,
 )
 from colmap_netvlad.report.layout import Layout, align, lay_out
-from colmap_netvlad.report.measures import count, percent, seconds, shown
+from colmap_netvlad.report.measures import NOT_RUNNING, count, percent, seconds, shown
 from colmap_netvlad.report.thumbnails import Thumbnails, data_uri
 
 
@@ -57,6 +58,7 @@ def render_page(comparison: Comparison, evidence: Evidence) -> str:
         comparison=comparison,
         headlines=_headlines(comparison),
         reference=reference_sentence(comparison),
+        apart=NOT_RUNNING,
         measures=shown(comparison),
         curves=_curves(comparison),
         legend=[(name, Markup(svg)) for name, svg in plots.legend(comparison)],
@@ -69,6 +71,7 @@ def render_page(comparison: Comparison, evidence: Evidence) -> str:
         partners_shown=PARTNERS,
         finds={name: (len(found), found[:FINDS]) for name, found in finds.items()},
         hardest=hardest_images(evidence),
+        full_ranking=comparison.images <= FULL_RANKING,
         thumbnail=Thumbnails(evidence.images),
         notes={method.name: notes_of(method) for method in comparison.methods},
     )
@@ -93,7 +96,7 @@ def _headlines(comparison: Comparison) -> list[str]:
             value = measures[key].show(named[0])
             of = f" of {comparison.images:,}" if key == "registered" else ""
             sentences.append(f"{phrase}: {_and(m.name for m in named)} ({value}{of}).")
-    registered = {m.name: m.model.registered for m in comparison.methods if m.model and m.ranks}
+    registered = {m.name: m.model.registered for m in comparison.methods if m.model and m.competes}
     if len(registered) > 1 and len(set(registered.values())) == 1:
         equal = next(iter(registered.values()))
         sentences.insert(0, f"All methods register {equal:,} of {comparison.images:,} images.")

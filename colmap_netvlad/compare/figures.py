@@ -1,0 +1,191 @@
+"""Rankings, matches and models -> the figures of a comparison and what is behind them."""
+
+from __future__ import annotations
+
+import math
+import platform
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pycolmap
+from scipy import sparse
+
+from colmap_netvlad import __version__, engine, metrics
+from colmap_netvlad.compare import pool
+from colmap_netvlad.compare.evidence import Evidence
+from colmap_netvlad.compare.finds import single_finds
+from colmap_netvlad.compare.models import read_plan
+from colmap_netvlad.compare.result import (
+    EXHAUSTIVE,
+    UNION,
+    Comparison,
+    MethodResult,
+    ModelFigures,
+    RetrievalFigures,
+)
+from colmap_netvlad.compare.workspace import ProjectFacts, Workspace
+from colmap_netvlad.metrics import Pair
+from colmap_netvlad.positions import read_positions
+from colmap_netvlad.project import Project
+from colmap_netvlad.retrieval.ranking import Ranking
+
+FULL_RANKING = 1000
+"""Up to this many images every method ranks all others, so that average precision is the
+textbook's; search is exact there, and the first k are the same as if k were asked for."""
+
+
+@dataclass
+class Candidate:
+    """One method under comparison: what it is called, and what is known of it so far."""
+
+    text: str
+    name: str
+    summary: str
+    ranking: Ranking | None = None
+    timed_earlier: bool = False
+    failed: str | None = None
+    model: ModelFigures | None = None
+
+    @property
+    def ranks(self) -> bool:
+        return self.name != EXHAUSTIVE
+
+
+def gather_evidence(
+    project: Project,
+    workspace: Workspace,
+    facts: ProjectFacts,
+    candidates: Sequence[Candidate],
+    pairs: Mapping[str, set[Pair]],
+) -> Evidence:
+    """Read from the workspace what the page shows beside the figures.
+
+    Args:
+        pairs: by method, its pairs at the largest k.
+    """
+    everything = metrics.verified_by_name(workspace.union)
+    if EXHAUSTIVE in pairs:
+        verified = everything
+    else:
+        # Pairs only the cost of exhaustive matching was measured on belong to no method.
+        wanted = set().union(*pairs.values())
+        verified = {pair: count for pair, count in everything.items() if pair in wanted}
+    plans = {
+        c.name: read_plan(workspace.model_folder(c.name))
+        for c in candidates
+        if c.model and not c.model.failed
+    }
+    return Evidence(
+        names=facts.names,
+        images=project.images,
+        partners={c.name: c.ranking.partners for c in candidates if c.ranking and c.ranks},
+        pairs=pairs,
+        verified=verified,
+        truth=metrics.correct_pairs(verified),
+        positions=read_positions(project).metres,
+        plans={name: plan for name, plan in plans.items() if plan is not None},
+    )
+
+
+def compute_figures(
+    project: Project,
+    workspace: Workspace,
+    facts: ProjectFacts,
+    candidates: Sequence[Candidate],
+    pairs: Mapping[int, Mapping[str, set[Pair]]],
+    evidence: Evidence,
+    seed: int,
+) -> Comparison:
+    """Return all figures.
+
+    Args:
+        pairs: by k and method, its distinct pairs.
+    """
+    ks = tuple(sorted(pairs))
+    widest = pairs[ks[-1]]
+    seconds = workspace.pair_seconds()
+    reference = EXHAUSTIVE if EXHAUSTIVE in widest else UNION
+    full = reference == EXHAUSTIVE and len(facts.names) <= FULL_RANKING
+    depth = len(facts.names) - 1 if full else ks[-1]
+    found = {name: len(finds) for name, finds in single_finds(evidence).items()}
+    methods = []
+    for candidate in candidates:
+        result = MethodResult(candidate.name, candidate.summary, failed=candidate.failed)
+        ranking = candidate.ranking
+        if ranking is not None:
+            seconds_match, share = pool.seconds_of(widest[candidate.name], seconds)
+            precision = metrics.mean_average_precision(ranking.top(depth), evidence.truth)
+            result = replace(
+                result,
+                notes=(*ranking.notes, *_left_out(ranking)),
+                seconds_describe=ranking.seconds_describe if candidate.ranks else None,
+                seconds_search=ranking.seconds_search if candidate.ranks else None,
+                timed_earlier=candidate.timed_earlier,
+                seconds_match=seconds_match,
+                match_measured=share,
+                mean_average_precision=_number(precision) if candidate.ranks else None,
+                only_here=found.get(candidate.name, 0),
+                at_k=tuple(_at_k(pairs[k][candidate.name], k, evidence) for k in ks),
+                model=candidate.model,
+            )
+        methods.append(result)
+    return Comparison(
+        project=project.database.name,
+        images=len(facts.names),
+        images_without_features=sum(count == 0 for count in facts.keypoints),
+        keypoints=sum(facts.keypoints),
+        ks=ks,
+        seed=seed,
+        reference=reference,
+        reference_pairs=len(evidence.truth),
+        precision_depth=depth,
+        pairs_matched=len(set().union(*widest.values())),
+        pairs_requested=sum(map(len, widest.values())),
+        seconds_matched=pool.seconds_of(set().union(*widest.values()), seconds)[0] or 0.0,
+        versions=_versions(),
+        methods=tuple(methods),
+    )
+
+
+def _at_k(pairs: set[Pair], k: int, evidence: Evidence) -> RetrievalFigures:
+    correct = pairs & evidence.truth
+    sizes = _component_sizes(evidence.names, correct)
+    return RetrievalFigures(
+        k=k,
+        pairs=len(pairs),
+        correct=len(correct),
+        accuracy=_number(metrics.accuracy(pairs, evidence.verified)),
+        recall=_number(metrics.recall(pairs, evidence.truth)),
+        components=len(sizes),
+        largest_component=max(sizes),
+    )
+
+
+def _component_sizes(names: Sequence[str], pairs: set[Pair]) -> list[int]:
+    index = {name: i for i, name in enumerate(names)}
+    ends = np.array([(index[a], index[b]) for a, b in sorted(pairs)], np.int64).reshape(-1, 2)
+    shape = (len(names), len(names))
+    graph = sparse.coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=shape)
+    _, labels = sparse.csgraph.connected_components(graph, directed=False)
+    return np.bincount(labels).tolist()
+
+
+def _left_out(ranking: Ranking) -> list[str]:
+    if not ranking.left_out:
+        return []
+    name, reason = ranking.left_out[0]
+    count = len(ranking.left_out)
+    return [f"{count} image{'s' if count > 1 else ''} left out (first: {name}: {reason})"]
+
+
+def _versions() -> dict[str, str]:
+    return {
+        "colmap-netvlad": __version__,
+        "pycolmap": pycolmap.__version__,
+        "Processor": f"{platform.machine()}, {engine.usable_processors()} cores",
+    }
+
+
+def _number(value: float) -> float | None:
+    return None if math.isnan(value) else value
