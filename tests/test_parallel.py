@@ -260,10 +260,11 @@ RUN = """
 import sys
 from pathlib import Path
 from colmap_netvlad.mapping.options import MappingOptions
-from colmap_netvlad.mapping.parallel import map_parallel
+from colmap_netvlad.mapping.parallel import reconstruct_parallel
 if __name__ == "__main__":
     options = MappingOptions(cluster_size=12, threads=1)
-    map_parallel(Path(sys.argv[1]), None, Path(sys.argv[2]), options)
+    _, report = reconstruct_parallel(Path(sys.argv[1]), None, Path(sys.argv[2]), options)
+    print(report.reused)
 """
 
 
@@ -275,8 +276,9 @@ def test_killed_in_each_stage_and_run_again_ends_with_the_same_figures(
     output, state = tmp_path / "sparse", tmp_path / ".sparse.clusters"
     every = [state / str(number) for number in range(len(mapped.clusters))]
 
-    def start() -> subprocess.Popen[bytes]:
-        return subprocess.Popen([sys.executable, script, mapped.database, output])
+    def start() -> subprocess.Popen[str]:
+        command = [sys.executable, script, mapped.database, output]
+        return subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
 
     def kill_when(condition: Callable[[], bool]) -> None:
         with start() as process:
@@ -288,14 +290,11 @@ def test_killed_in_each_stage_and_run_again_ends_with_the_same_figures(
 
     kill_when(lambda: any(tmp_path.glob(".sparse.*")))  # before the graph is cut
     kill_when(lambda: every[0].exists())  # clusters are being mapped
-    born = every[0].stat().st_mtime_ns
     kill_when(lambda: all(path.exists() for path in every))  # clusters are being merged
     with start() as process:
-        while (state / "0").exists() or process.poll() is None:
-            if every[0].exists():
-                assert every[0].stat().st_mtime_ns == born
-            time.sleep(0.05)
+        told, _ = process.communicate()
     assert process.returncode == 0
+    assert told == f"{len(every)}\n"
     model = pycolmap.Reconstruction(output / "0")
     assert model.num_reg_images() == mapped.model.num_reg_images()
     assert model.num_points3D() == mapped.model.num_points3D()

@@ -93,12 +93,13 @@ def refine(
         options.get_triangulation(),
     )
     mapper.filter_frames(options.get_mapper())
-    mapper.end_reconstruction(False)
     if reconstruction.num_reg_images() < cache.num_images():
         # COLMAP's own loop: register, triangulate, adjust locally, adjust globally in the end.
+        # It begins the reconstruction anew; ending it before would remove the missed images.
         pipeline = pycolmap.IncrementalPipeline(options, cache, pycolmap.ReconstructionManager())
         next_image = pycolmap.IncrementalPipelineCallback.NEXT_IMAGE_REG_CALLBACK
         pipeline.add_callback(next_image.value, registered)
+        mapper = pycolmap.IncrementalMapper(cache)
         pipeline.reconstruct_sub_model(mapper, options.get_mapper(), reconstruction)
-        mapper.end_reconstruction(False)
+    mapper.end_reconstruction(False)
     reconstruction.update_point_3d_errors()
