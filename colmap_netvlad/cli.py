@@ -697,7 +697,12 @@ def compare(
     "--method", default="bow", show_default=True, help="Retrieval method that chooses the pairs."
 )
 @k_option
-@click.option("--mapper", default="incremental", show_default=True, help="Mapping method.")
+@click.option(
+    "--mapper",
+    default="incremental",
+    show_default=True,
+    help="Mapping method; none: tracks of verified matches stand for 3D points (fast, no poses).",
+)
 @seed_option
 @verbose_option
 def annotate(

@@ -17,6 +17,7 @@ import pytest
 from click.testing import CliRunner
 
 from colmap_netvlad.cli import cli
+from colmap_netvlad.database import open_database
 from colmap_netvlad.demo.render import Flight
 from colmap_netvlad.errors import EXIT_PARTIAL, InputError
 from colmap_netvlad.project import Project
@@ -89,6 +90,42 @@ def test_similarity_is_the_number_of_common_points_of_the_model(annotated: Path)
     for i, name in enumerate(scene.names):
         points, at = scene.observations.of(i)
         assert len(points) == len(sees[name]) and np.abs(at).max() <= 0.5
+
+
+def test_without_a_mapper_tracks_of_verified_matches_stand_for_points(
+    dataset: Path, matched_database: Path, annotated: Path, tmp_path: Path
+) -> None:
+    """Tracks against a literal union of matched keypoints; GS goes with the reconstruction's."""
+    (tmp_path / "databases").mkdir()
+    shutil.copy(matched_database, tmp_path / "databases" / "village.db")
+    options = AnnotateOptions(
+        output=tmp_path / "out", databases=tmp_path / "databases", mapper="none"
+    )
+    (scene,) = annotate([dataset], options).scenes
+    parent: dict[tuple[int, int], tuple[int, int]] = {}
+
+    def root(key: tuple[int, int]) -> tuple[int, int]:
+        while parent.setdefault(key, key) != key:
+            key = parent[key]
+        return key
+
+    with open_database(matched_database) as opened:
+        ids = {row.name: row.image_id for row in opened.images()}
+        for (a, b), count in opened.verified_matches().items():
+            if count > 15:
+                for i, j in opened.inlier_matches(a, b).tolist():
+                    parent[root((a, i))] = root((b, j))
+    members: dict[tuple[int, int], list[int]] = {}
+    for key in list(parent):
+        members.setdefault(root(key), []).append(key[0])
+    consistent = [set(images) for images in members.values() if len(images) == len(set(images))]
+    assert scene.points == len(consistent)
+    similarity = scene.common_points.toarray()
+    for i, a in enumerate(scene.names):
+        for j, b in enumerate(scene.names[:i]):
+            assert similarity[i, j] == sum({ids[a], ids[b]} <= track for track in consistent)
+    reconstructed = load_annotation(annotated / "village" / ANNOTATION).common_points.toarray()
+    assert np.corrcoef(similarity.ravel(), reconstructed.ravel())[0, 1] > 0.9
 
 
 def test_poses_are_those_of_the_model(annotated: Path) -> None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_netvlad.database import copy_database, open_database
+from colmap_netvlad.database import ImageRow, copy_database, open_database
 from colmap_netvlad.errors import InputError
 from colmap_netvlad.images import (
     PHOTO_SUFFIXES,
@@ -31,9 +31,12 @@ from colmap_netvlad.training.scenes import (
     save_annotation,
     symmetric,
 )
+from colmap_netvlad.training.tracks import tracks
 
 if TYPE_CHECKING:
     import pycolmap
+
+NO_MAPPER = "none"
 
 MIN_REGISTERED = 3
 """A scene with fewer registered images did not reconstruct."""
@@ -59,7 +62,8 @@ class AnnotateOptions:
             each scene's photos.
         databases: folder of matched COLMAP databases, `<scene>.db`; a scene found there is
             neither extracted nor matched again (its database is copied, never opened itself).
-        mapper: name of the mapping method.
+        mapper: name of the mapping method, or `NO_MAPPER`: tracks of verified matches stand for
+            3D points. That is fast and lacks poses and the filter of a reconstruction.
         seed: of retrieval and mapping.
     """
 
@@ -123,8 +127,9 @@ def annotate(datasets: Sequence[Path], options: AnnotateOptions) -> AnnotateRepo
 
     report = AnnotateReport()
     find_method(options.method)
-    if options.mapper not in MAPPERS:
-        raise InputError(f"No mapper is called {options.mapper!r}: there are {', '.join(MAPPERS)}.")
+    if options.mapper not in (*MAPPERS, NO_MAPPER):
+        known = ", ".join((*MAPPERS, NO_MAPPER))
+        raise InputError(f"No mapper is called {options.mapper!r}: there are {known}.")
     for folder in find_scenes(datasets):
         console.print(f"Scene {folder.name}", highlight=False)
         try:
@@ -158,9 +163,16 @@ def annotate_scene(folder: SceneFolder, options: AnnotateOptions) -> Scene:
     work.mkdir(parents=True, exist_ok=True)
     database = work / "database.db"
     method = _matched_database(folder, database, options)
-    shutil.rmtree(work / "sparse", ignore_errors=True)  # ours, of a run that was killed
-    models = _map(database, folder.images, work / "sparse", options)
-    scene = scene_of(folder, database, models, method)
+    if options.mapper == NO_MAPPER:
+        seen, points = tracks(database)
+        observed = np.diff(seen.first) > 0
+        model_of = np.where(observed, 0, -1).astype(np.int32)
+        poses = np.full((len(observed), 7), np.nan)
+    else:
+        shutil.rmtree(work / "sparse", ignore_errors=True)  # ours, of a run that was killed
+        models = _map(database, folder.images, work / "sparse", options)
+        seen, points, model_of, poses = _of_models(models, database)
+    scene = _scene(folder, database, method, seen, points, model_of, poses)
     save_annotation(scene, path)
     return scene
 
@@ -203,13 +215,16 @@ def _is_whole(path: Path) -> bool:
     return True
 
 
-def scene_of(
-    folder: SceneFolder, database: Path, models: Sequence[pycolmap.Reconstruction], method: str
+def _scene(
+    folder: SceneFolder,
+    database: Path,
+    method: str,
+    seen: Observations,
+    points: int,
+    model_of: NDArray[np.int32],
+    poses: NDArray[np.float64],
 ) -> Scene:
-    """Build the annotation of a scene from its matched database and reconstructed models.
-
-    An image that is in several models counts in the one with most of its points; images of
-    different models have no common points.
+    """Build the annotation of a scene.
 
     Raises:
         InputError: fewer than `MIN_REGISTERED` images are registered.
@@ -217,33 +232,49 @@ def scene_of(
     with open_database(database) as opened:
         rows = opened.images()
         verified = opened.verified_matches()
-    index = {row.image_id: number for number, row in enumerate(rows)}
-    names = tuple(row.name for row in rows)
-    sizes = np.array([(row.width, row.height) for row in rows], np.int32).reshape(-1, 2)
-    model_of = _models_of(models, names)
     registered = int((model_of >= 0).sum())
     if registered < MIN_REGISTERED:
         raise InputError(
-            f"it does not reconstruct ({registered} of {len(names)} photos registered); "
+            f"it does not reconstruct ({registered} of {len(rows)} photos registered); "
             "its photos overlap too little, or are of different places."
         )
-    seen, points = _observations(models, model_of, names, sizes)
-    complete = len(verified) == len(names) * (len(names) - 1) // 2
+    index = {row.image_id: number for number, row in enumerate(rows)}
+    complete = len(verified) == len(rows) * (len(rows) - 1) // 2
     matches = [(index[a], index[b], n) for (a, b), n in verified.items() if n]
     return Scene(
         name=folder.name,
         images=folder.images,
-        names=names,
+        names=tuple(row.name for row in rows),
         common_points=common_points(seen, points),
-        matches=symmetric(matches, len(names)),
-        sizes=sizes,
+        matches=symmetric(matches, len(rows)),
+        sizes=_sizes(rows),
         model=model_of,
-        poses=_poses(models, model_of, names),
+        poses=poses,
         points=points,
         method="exhaustive" if complete else method,
-        fingerprints=tuple(_fingerprint(folder.images / name) for name in names),
+        fingerprints=tuple(_fingerprint(folder.images / row.name) for row in rows),
         observations=seen,
     )
+
+
+def _sizes(rows: Sequence[ImageRow]) -> NDArray[np.int32]:
+    return np.array([(row.width, row.height) for row in rows], np.int32).reshape(-1, 2)
+
+
+def _of_models(
+    models: Sequence[pycolmap.Reconstruction], database: Path
+) -> tuple[Observations, int, NDArray[np.int32], NDArray[np.float64]]:
+    """Return observations, number of points, models and poses of a scene's images.
+
+    An image that is in several models counts in the one with most of its points; images of
+    different models have no common points.
+    """
+    with open_database(database) as opened:
+        rows = opened.images()
+    names = [row.name for row in rows]
+    model_of = _models_of(models, names)
+    seen, points = _observations(models, model_of, names, _sizes(rows))
+    return seen, points, model_of, _poses(models, model_of, names)
 
 
 def _fingerprint(path: Path) -> str:
