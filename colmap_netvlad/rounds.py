@@ -172,6 +172,31 @@ def next_round(
     )
 
 
+def replay(
+    similarity: sparse.csr_array,
+    truth: Mapping[IndexPair, int],
+    names: Sequence[str],
+    budget: int,
+    rounds: int,
+    weights: Weights = FITTED,
+) -> Iterator[dict[IndexPair, int]]:
+    """Play rounds on a flight whose every pair is matched already; nothing is matched.
+
+    Args:
+        truth: verified matches of all pairs; absent pairs have none.
+
+    Yields:
+        After each round the verified matches of all pairs tested so far.
+    """
+    tested: dict[IndexPair, int] = {}
+    allowed = 0
+    for size in split_budget(budget, rounds):
+        allowed += size
+        chosen = next_round(similarity, tested, names, allowed - len(tested), weights)
+        tested.update((pair, truth.get(pair, 0)) for pair in chosen)
+        yield dict(tested)
+
+
 def split_budget(budget: int, rounds: int) -> list[int]:
     """Return the size of each round; they add up to the budget, none is empty if it can help."""
     share, rest = divmod(budget, rounds)

@@ -1,0 +1,101 @@
+"""Rounds against one round at equal numbers of matched pairs, replayed on exhaustive matches.
+
+    python benchmarks/rounds.py --methods hybrid,vlad SCENE.db:PHOTOS [SCENE.db:PHOTOS ...]
+
+Each flight's database holds every pair matched, so a choice of pairs is judged without matching
+anything. For each k: accuracy and recall of the union of each image's k nearest (one round, the
+paper's), of 3 rounds with the same number of pairs, and the share of those pairs with which
+3 rounds reach the one round's recall. Databases are only read.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+import numpy as np
+from scipy import sparse
+
+from colmap_netvlad.database import image_names
+from colmap_netvlad.metrics import CORRECT_MATCHES
+from colmap_netvlad.project import Project
+from colmap_netvlad.retrieval.fusion import similarity_matrix
+from colmap_netvlad.retrieval.methods import RetrievalOptions, rank
+from colmap_netvlad.retrieval.ranking import NO_PARTNER, Ranking
+from colmap_netvlad.rounds import IndexPair, replay
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
+from fit_rounds import read_scene, truth_of
+
+ROUNDS = 3
+SHARES = np.arange(0.3, 1.01, 0.05)
+
+
+def one_round(ranking: Ranking, k: int) -> set[IndexPair]:
+    return {
+        (min(i, int(j)), max(i, int(j)))
+        for i, row in enumerate(ranking.partners[:, :k])
+        for j in row
+        if j != NO_PARTNER
+    }
+
+
+def correct(pairs: set[IndexPair], truth: dict[IndexPair, int]) -> int:
+    return sum(truth.get(pair, 0) > CORRECT_MATCHES for pair in pairs)
+
+
+def spend(
+    similarity: sparse.csr_array, truth: dict[IndexPair, int], names: tuple[str, ...], budget: int
+) -> set[IndexPair]:
+    *_, last = replay(similarity, truth, names, budget, ROUNDS)
+    return set(last)
+
+
+def table(project: Project, methods: list[str], ks: list[int], gps: str | None) -> None:
+    names, truth = image_names(project.database), truth_of(project)
+    total = correct(set(truth), truth)
+    print(f"\n{project.database.stem}: {len(names)} images, {total:,} true pairs")
+    print(
+        "| method | k | pairs | accuracy | recall | 3 rounds: accuracy | recall | same recall at |"
+    )
+    print("|---|---|---|---|---|---|---|---|")
+    for method in methods:
+        ranking = rank(project, method, RetrievalOptions(k=len(names) - 1, gps=gps))
+        similarity = similarity_matrix(ranking)
+        for k in ks:
+            chosen = one_round(ranking, k)
+            hits = correct(chosen, truth)
+            rounds = spend(similarity, truth, names, len(chosen))
+            hits_of_rounds = correct(rounds, truth)
+            share = next(
+                (
+                    f"{share:.0%}"
+                    for share in SHARES
+                    if correct(spend(similarity, truth, names, int(share * len(chosen))), truth)
+                    >= hits
+                ),
+                "more",
+            )
+            print(
+                f"| {method} | {k} | {len(chosen):,} | {hits / len(chosen):.1%} "
+                f"| {hits / total:.1%} | {hits_of_rounds / len(rounds):.1%} "
+                f"| {hits_of_rounds / total:.1%} | {share} |",
+                flush=True,
+            )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--methods", default="hybrid,vlad")
+    parser.add_argument("--k", default="5,10,20")
+    parser.add_argument("--gps", help="auto, off or require")
+    parser.add_argument("scenes", nargs="+", metavar="DATABASE:PHOTOS")
+    arguments = parser.parse_args()
+    for scene in arguments.scenes:
+        ks = [int(k) for k in arguments.k.split(",")]
+        table(read_scene(scene), arguments.methods.split(","), ks, arguments.gps)
+
+
+if __name__ == "__main__":
+    main()
