@@ -120,6 +120,25 @@ def test_figures_equal_those_of_a_method_run_alone(whole, project_copy: Make):
     assert together.model.registered > 2
 
 
+def test_models_made_earlier_are_shown_without_reconstruct(whole, project_copy: Make):
+    _, folder, _ = whole
+    project = project_copy()
+    shutil.copytree(folder / "project-compare", project.folder / "project-compare")
+    comparison, _ = compare(project, ["spatial"], FAST)
+    assert all(m.model for m in comparison.methods[:3])
+    assert comparison.methods[3].model is None
+
+
+def test_a_comparison_in_which_every_method_fails_is_still_written(project_copy: Make, monkeypatch):
+    def fails(*args):
+        raise InputError("Nothing works.")
+
+    monkeypatch.setattr(pipeline, "rank", fails)
+    comparison, workspace = compare(project_copy(), METHODS, OPTIONS)
+    assert comparison.incomplete == ["vlad: Nothing works.", "random: Nothing works."]
+    assert "Nothing works." in workspace.html.read_text()
+
+
 class Killed(BaseException):
     """Stands for a kill: nothing catches it."""
 

@@ -25,6 +25,9 @@ from colmap_netvlad.metrics import Pair
 
 MATCH_TABLES = ("matches", "two_view_geometries")
 
+FIGURES = "figures.json"
+"""Written last: a folder that has it is complete."""
+
 PLAN_POINTS = 20_000
 """Points of a model kept for its plan: more cannot be told apart in a figure of a page."""
 
@@ -46,11 +49,9 @@ def reconstruct_once(
         pairs: the method's pairs.
         k: partners an image they come from, for the figures.
     """
-    done, digest = folder / "figures.json", _digest(union, pairs, k, options)
-    if done.is_file():
-        kept = json.loads(done.read_text(encoding="utf-8"))
-        if kept.pop("digest", None) == digest:
-            return ModelFigures(**kept)
+    kept = kept_figures(folder, pairs, k, options)
+    if kept is not None:
+        return kept
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     database = folder / "database.db"
@@ -74,8 +75,20 @@ def reconstruct_once(
             seconds=seconds,
         )
         _save_plan(folder / "plan.npz", largest)
-    write_atomically(done, json.dumps({**asdict(figures), "digest": digest}, indent=1))
+    content = {**asdict(figures), "digest": _digest(pairs, k, options)}
+    write_atomically(folder / FIGURES, json.dumps(content, indent=1))
     return figures
+
+
+def kept_figures(
+    folder: Path, pairs: Collection[Pair], k: int, options: MappingOptions
+) -> ModelFigures | None:
+    """Return the figures of an earlier run with the same pairs and options, or None."""
+    if not (folder / FIGURES).is_file():
+        return None
+    kept = json.loads((folder / FIGURES).read_text(encoding="utf-8"))
+    same = kept.pop("digest", None) == _digest(pairs, k, options)
+    return ModelFigures(**kept) if same else None
 
 
 def read_plan(folder: Path) -> Plan | None:
@@ -130,6 +143,6 @@ def _save_plan(path: Path, model: object) -> None:
         )
 
 
-def _digest(union: Path, pairs: Collection[Pair], k: int, options: MappingOptions) -> str:
-    text = "\n".join([f"{union.name} {k} {options!r}", *(f"{a}\t{b}" for a, b in sorted(pairs))])
+def _digest(pairs: Collection[Pair], k: int, options: MappingOptions) -> str:
+    text = "\n".join([f"{k} {options!r}", *(f"{a}\t{b}" for a, b in sorted(pairs))])
     return hashlib.sha256(text.encode("utf-8")).hexdigest()

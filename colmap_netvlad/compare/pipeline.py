@@ -16,7 +16,7 @@ from colmap_netvlad.compare.figures import (
     compute_figures,
     gather_evidence,
 )
-from colmap_netvlad.compare.models import reconstruct_once
+from colmap_netvlad.compare.models import kept_figures, reconstruct_once
 from colmap_netvlad.compare.result import (
     Comparison,
     ModelFigures,
@@ -49,7 +49,7 @@ class CompareOptions:
     Attributes:
         ks: numbers of partners to compare; clamped to the number of other images.
         output: the comparison's folder; None: `<database>-compare` beside the database.
-        reconstruct: whether each method's model is made.
+        reconstruct: whether each method's model is made; one made earlier is shown in any case.
         reconstruct_k: the number of partners the models are made from, one of `ks`; None: the
             largest.
         retrieval: device, vocabulary tree; its k and seed are set from here.
@@ -106,11 +106,10 @@ def compare(
     pairs = {k: {c.name: _pairs(c, k) for c in candidates if c.ranking} for k in ks}
     matched_now = pool.match_once(workspace, pairs[ks[-1]], matching)
     _say_matched(pairs[ks[-1]], matched_now)
-    if options.reconstruct:
-        k = ks[-1] if options.reconstruct_k is None else _clamped(options.reconstruct_k, facts)
-        for candidate in candidates:
-            if candidate.ranking:
-                _map(candidate, workspace, project.images, pairs[k][candidate.name], k, options)
+    k = ks[-1] if options.reconstruct_k is None else _clamped(options.reconstruct_k, facts)
+    for candidate in candidates:
+        if candidate.ranking:
+            _map(candidate, workspace, project.images, pairs[k][candidate.name], k, options)
     evidence = gather_evidence(project, workspace, facts, candidates, pairs[ks[-1]])
     comparison = compute_figures(
         project, workspace, facts, candidates, pairs, evidence, options.seed
@@ -264,6 +263,9 @@ def _map(
 ) -> None:
     mapping = replace(options.mapping, seed=options.seed)
     folder = workspace.model_folder(candidate.name)
+    candidate.model = kept_figures(folder, pairs, k, mapping)
+    if candidate.model or not options.reconstruct:
+        return
     progress.console.print(f"Mapping {candidate.name}", highlight=False)
     try:
         candidate.model = reconstruct_once(workspace.union, images, folder, pairs, k, mapping)
