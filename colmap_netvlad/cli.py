@@ -70,6 +70,11 @@ method_option = click.option(
     show_default=True,
     help="Retrieval method of --rounds; `colmap-netvlad methods` lists them.",
 )
+pairs_option = click.option(
+    "--pairs",
+    type=click.Path(path_type=Path),
+    help="Pairs list (COLMAP's, .csv or .json).  [default: pairs.txt beside the database]",
+)
 gps_option = click.option(
     "--gps",
     type=click.Choice(["auto", "off", "require"]),
@@ -209,11 +214,7 @@ def features(images: Path, database: Path, **options: Any) -> None:
 @cli.command()
 @database_option
 @images_option
-@click.option(
-    "--pairs",
-    type=click.Path(path_type=Path),
-    help="Pairs list (COLMAP's, .csv or .json).  [default: pairs.txt beside the database]",
-)
+@pairs_option
 @click.option(
     "--output",
     "--output_path",
@@ -314,11 +315,7 @@ def reconstruct(
 @cli.command()
 @database_option
 @images_option
-@click.option(
-    "--pairs",
-    type=click.Path(path_type=Path),
-    help="Pairs list (COLMAP's, .csv or .json).  [default: pairs.txt beside the database]",
-)
+@pairs_option
 @copy_option
 @rounds_options
 @k_option
@@ -492,6 +489,11 @@ def quoted(path: Path) -> str:
     show_default=True,
     help="Pair each photo with this many that follow it by name too (video, flight lines).",
 )
+@click.option(
+    "--masks",
+    type=FOLDER,
+    help="Folder of masks in COLMAP's way (<photo>.png): black areas are neutral to networks.",
+)
 @click.option("--join", "own_pairs", type=FILE, help="A pairs list of your own to join in.")
 @cache_option
 @device_option
@@ -511,6 +513,7 @@ def pairs(
     other_cameras: float,
     sequential: int,
     own_pairs: Path | None,
+    masks: Path | None,
     cache: Path | None,
     device: str | None,
     seed: int,
@@ -528,7 +531,14 @@ def pairs(
 
     project = find_project(database, images, cache)
     options = RetrievalOptions(
-        k=k, model=model, device=device, seed=seed, vocab_tree=vocab_tree, exact=exact, gps=gps
+        k=k,
+        model=model,
+        device=device,
+        seed=seed,
+        vocab_tree=vocab_tree,
+        exact=exact,
+        masks=masks,
+        gps=gps,
     )
     rules = PartnerRules(other_cameras, sequential, own_pairs)
     report = make_pairs(project, method or DEFAULT, options, format, output, rules)

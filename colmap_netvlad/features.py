@@ -24,6 +24,7 @@ from colmap_netvlad.images import (
     PHOTO_SUFFIXES,
     BadPhoto,
     PhotoHeader,
+    find_mask,
     find_photos,
     read_header,
 )
@@ -200,14 +201,7 @@ def _read_headers(
 
 def _without_mask(headers: dict[str, PhotoHeader], masks: Path) -> list[tuple[str, str]]:
     """Take the photos out that have no mask; COLMAP would pass over them without a word."""
-    missing = [
-        name
-        for name in headers
-        if not any(
-            (masks / mask).is_file()
-            for mask in (f"{name}.png", str(Path(name).with_suffix(".png")))
-        )
-    ]
+    missing = [name for name in headers if find_mask(masks, name) is None]
     for name in missing:
         del headers[name]
     return [(name, f"has no mask {masks / name}.png") for name in missing]

@@ -159,12 +159,41 @@ def decode_photo(path: Path, long_side: int) -> NDArray[np.uint8]:
     return np.asarray(cv2.cvtColor(resized, cv2.COLOR_BGR2RGB), np.uint8)
 
 
+def find_mask(masks: Path, name: str) -> Path | None:
+    """Return the mask of a photo in COLMAP's way, `<name>.png` or its stem's, or None."""
+    candidates = (masks / f"{name}.png", (masks / name).with_suffix(".png"))
+    return next((mask for mask in candidates if mask.is_file()), None)
+
+
+def neutralise(pixels: NDArray[np.uint8], mask: Path) -> NDArray[np.uint8]:
+    """Return the photo with its masked area (black in the mask) in the mean colour of the rest.
+
+    An even area has no texture for a network to describe. A mask that covers everything leaves
+    an even grey photo.
+
+    Args:
+        pixels: (H, W, 3) uint8.
+        mask: a picture of any size that is stretched over the photo.
+
+    Raises:
+        BadPhoto: the mask cannot be read.
+    """
+    shape = cv2.imdecode(np.frombuffer(_read(mask), np.uint8), cv2.IMREAD_GRAYSCALE)
+    if shape is None:
+        raise BadPhoto(f"has a mask that is no picture ({mask})")
+    size = (pixels.shape[1], pixels.shape[0])
+    seen = cv2.resize(shape, size, interpolation=cv2.INTER_NEAREST) > 0
+    fill = pixels[seen].mean(axis=0) if seen.any() else 128.0
+    return np.where(seen[:, :, None], pixels, np.round(fill)).astype(np.uint8)
+
+
 def load_batches(
     folder: Path,
     names: Iterable[str],
     long_side: int,
     batch_size: int,
     workers: int | None = None,
+    masks: Path | None = None,
 ) -> Iterator[PhotoBatch]:
     """Decode photos in threads while the caller works on the batches already decoded.
 
@@ -178,7 +207,14 @@ def load_batches(
         long_side: as in `decode_photo`.
         batch_size: photos of a full batch.
         workers: decoding threads; default: one for each processor.
+        masks: folder of masks; masked areas become neutral. Photos without one are taken whole.
     """
+
+    def decode(name: str) -> NDArray[np.uint8]:
+        pixels = decode_photo(folder / name, long_side)
+        mask = find_mask(masks, name) if masks is not None else None
+        return pixels if mask is None else neutralise(pixels, mask)
+
     workers = workers or os.cpu_count() or 1
     waiting: dict[tuple[int, ...], list[tuple[str, NDArray[np.uint8]]]] = defaultdict(list)
     bad: list[tuple[str, str]] = []
@@ -192,7 +228,7 @@ def load_batches(
                 name = next(todo, None)
                 if name is None:
                     break
-                queue.append((name, pool.submit(decode_photo, folder / name, long_side)))
+                queue.append((name, pool.submit(decode, name)))
             if not queue:
                 break
             name, future = queue.popleft()

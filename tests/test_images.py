@@ -7,6 +7,7 @@ import re
 import shutil
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -207,3 +208,33 @@ def test_real_photos_decode_whole(shared_data: Path) -> None:
         name = find_photos(images)[0]
         assert max(decode_photo(images / name, 480).shape) == 480
         assert re.fullmatch("[0-9a-f]{64}", photo_fingerprint(images / name))
+
+
+def test_masked_areas_become_neutral_and_photos_without_a_mask_are_taken_whole(
+    tmp_path: Path,
+) -> None:
+    photo = np.zeros((64, 96, 3), np.uint8)
+    photo[:, :48] = (10, 20, 30)
+    photo[:, 48:] = np.random.default_rng(0).integers(0, 256, (64, 48, 3), dtype=np.uint8)
+    for name in ("masked.png", "plain.png"):
+        cv2.imwrite(str(tmp_path / name), photo)
+    masks = tmp_path / "masks"
+    masks.mkdir()
+    mask = np.full((64, 96), 255, np.uint8)
+    mask[:, 48:] = 0
+    cv2.imwrite(str(masks / "masked.png.png"), mask)
+
+    (batch,) = load_batches(tmp_path, ["masked.png", "plain.png"], 96, 2, masks=masks)
+
+    masked, plain = batch.pixels
+    assert (masked[:, :, 48:] == np.array([30, 20, 10])[:, None, None]).all()
+    assert plain[:, :, 48:].std() > 50
+    assert (masked[:, :, :48] == plain[:, :, :48]).all()
+
+
+def test_a_broken_mask_is_a_reason_to_leave_the_photo_out(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "a.png"), np.full((32, 32, 3), 9, np.uint8))
+    (tmp_path / "a.png.png").write_bytes(b"no mask")
+    (batch,) = load_batches(tmp_path, ["a.png"], 32, 2, masks=tmp_path)
+    assert batch.names == ()
+    assert "mask that is no picture" in batch.bad[0][1]

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from colmap_netvlad.database import image_names
 from colmap_netvlad.errors import InputError
-from colmap_netvlad.images import BadPhoto, load_batches, photo_fingerprint
+from colmap_netvlad.images import BadPhoto, find_mask, load_batches, photo_fingerprint
 from colmap_netvlad.models.catalogue import CATALOGUE
 from colmap_netvlad.progress import step
 from colmap_netvlad.project import Project
@@ -42,7 +42,7 @@ def rank(project: Project, name_or_path: str | Path, options: RetrievalOptions) 
     checkpoint = checkpoint_file(name_or_path)
     names = image_names(project.database)
     with Store(project.cache) as store:
-        photos, left_out = fingerprints(folder, names)
+        photos, left_out = fingerprints(folder, names, options.masks)
         model = model_fingerprint(checkpoint)
         to_do = missing(store, model, photos)
         bad = _describe(store, model, checkpoint, folder, to_do, photos, options)
@@ -78,12 +78,19 @@ def model_fingerprint(checkpoint: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def fingerprints(folder: Path, names: Sequence[str]) -> tuple[dict[str, str], dict[str, str]]:
-    """Return (name -> content fingerprint) and (name -> reason) of photos that have none."""
+def fingerprints(
+    folder: Path, names: Sequence[str], masks: Path | None = None
+) -> tuple[dict[str, str], dict[str, str]]:
+    """Return (name -> content fingerprint) and (name -> reason) of photos that have none.
+
+    A photo seen through a mask is another content.
+    """
 
     def one(name: str) -> tuple[str, str]:
         try:
-            return photo_fingerprint(folder / name), ""
+            photo = photo_fingerprint(folder / name)
+            mask = find_mask(masks, name) if masks is not None else None
+            return photo if mask is None else f"{photo}-{photo_fingerprint(mask)}", ""
         except BadPhoto as fault:
             return "", str(fault)
 
@@ -113,7 +120,13 @@ def _describe(
 
     network = load_model(checkpoint, options.device)
     bad: dict[str, str] = {}
-    batches = load_batches(folder, names, network.long_side, options.batch_size or BATCH_SIZE)
+    batches = load_batches(
+        folder,
+        names,
+        network.long_side,
+        options.batch_size or BATCH_SIZE,
+        masks=options.masks,
+    )
     start = time.perf_counter()
     with step("Describing photos", len(names)) as bar:
         for batch in batches:

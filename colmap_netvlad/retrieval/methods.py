@@ -33,6 +33,7 @@ class RetrievalOptions:
         batch_size: photos described at once; None: the method's own.
         vocab_tree: the vocabulary tree of `bow`; None: see `bow.find_tree`.
         exact: True or False forces exact search or HNSW; None: see `search.EXACT_UP_TO`.
+        masks: folder of masks in COLMAP's way: masked areas are neutral to deep descriptors.
         gps: whether positions re-weight the candidates, one of `GPS_MODES`; None: "auto" for
             methods that are not from the literature, else "off".
     """
@@ -44,6 +45,7 @@ class RetrievalOptions:
     batch_size: int | None = None
     vocab_tree: Path | None = None
     exact: bool | None = None
+    masks: Path | None = None
     gps: str | None = None
 
 
