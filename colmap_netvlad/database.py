@@ -231,9 +231,16 @@ def open_database(path: Path) -> Iterator[Database]:
 def _connect(path: Path) -> sqlite3.Connection:
     if not path.is_file():
         raise InputError(f"The database {path} does not exist; mend --db.")
-    uri = f"{path.resolve().as_uri()}?mode=ro"
-    connection = sqlite3.connect(uri, uri=True, timeout=BUSY_SECONDS, check_same_thread=False)
+    uri = path.resolve().as_uri()
+    wal = path.with_name(path.name + "-wal")
+    # A WAL database at rest is opened for writing and then only queried: a read-only connection
+    # could not take away the -wal and -shm files it makes beside the user's database.
+    mode = "rw" if _is_wal(path) and not wal.exists() else "ro"
+    connection = sqlite3.connect(
+        f"{uri}?mode={mode}", uri=True, timeout=BUSY_SECONDS, check_same_thread=False
+    )
     try:
+        connection.execute("PRAGMA query_only = ON")
         tables = _tables(connection)
     except sqlite3.OperationalError as fault:
         connection.close()
@@ -241,10 +248,11 @@ def _connect(path: Path) -> sqlite3.Connection:
             raise
         # A WAL database in a read-only folder cannot make its shared-memory file; where no log
         # waits beside it nothing can be missed by reading it as immutable.
-        wal = path.with_name(path.name + "-wal")
         if wal.exists() and wal.stat().st_size > 0:
             raise
-        connection = sqlite3.connect(f"{uri}&immutable=1", uri=True, check_same_thread=False)
+        connection = sqlite3.connect(
+            f"{uri}?mode=ro&immutable=1", uri=True, check_same_thread=False
+        )
         tables = _tables(connection)
     missing = {"cameras", "images", "keypoints", "descriptors", "matches"} - tables
     if missing:
@@ -253,6 +261,12 @@ def _connect(path: Path) -> sqlite3.Connection:
             f"{path} is not a COLMAP database: it has no table {', '.join(sorted(missing))}."
         )
     return connection
+
+
+def _is_wal(path: Path) -> bool:
+    """Whether sqlite's header says write-ahead logging (bytes 18 and 19 are 2)."""
+    with path.open("rb") as file:
+        return file.read(20)[18:] == b"\x02\x02"
 
 
 def _tables(connection: sqlite3.Connection) -> set[str]:

@@ -133,6 +133,31 @@ def test_a_feature_copy_has_no_matches_and_leaves_its_source(database: Path) -> 
         assert copy.matched_pairs() == set()
 
 
+def test_reading_a_wal_database_at_rest_leaves_no_files_beside_it(database: Path) -> None:
+    with closing(sqlite3.connect(database)) as writer:
+        writer.execute("PRAGMA journal_mode = WAL")
+    before, changed = _sha256(database), database.stat().st_mtime_ns
+    assert image_names(database) == NAMES
+    assert [p.name for p in database.parent.iterdir()] == ["project.db"]
+    assert _sha256(database) == before
+    assert database.stat().st_mtime_ns == changed
+
+
+def test_a_log_left_by_a_killed_writer_stays_as_it_is(database: Path, tmp_path: Path) -> None:
+    with closing(sqlite3.connect(database)) as writer:
+        writer.execute("PRAGMA journal_mode = WAL")
+        writer.execute("INSERT INTO images (image_id, name, camera_id) VALUES (9, 'new.jpg', 1)")
+        writer.commit()
+        killed = tmp_path / "killed"
+        killed.mkdir()
+        for suffix in ("", "-wal"):
+            left = database.with_name(database.name + suffix)
+            (killed / left.name).write_bytes(left.read_bytes())
+    before = {p.name: _sha256(p) for p in killed.iterdir()}
+    assert image_names(killed / "project.db")[-1] == "new.jpg"
+    assert {name: _sha256(killed / name) for name in before} == before
+
+
 def test_a_waiting_write_ahead_log_is_read_too(database: Path) -> None:
     with closing(sqlite3.connect(database)) as writer:
         writer.execute("PRAGMA journal_mode = WAL")
