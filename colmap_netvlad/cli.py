@@ -234,7 +234,7 @@ def features(images: Path, database: Path, **options: Any) -> None:
 @click.option(
     "--cluster-size",
     type=click.IntRange(min=3),
-    help="Images of a cluster of parallel and hierarchical mapping.  [default: 150]",
+    help="Images of a cluster of parallel and hierarchical mapping.  [default: 250]",
 )
 @click.option(
     "--threads", type=click.IntRange(min=1), help="Processors for mapping.  [default: all]"
