@@ -146,6 +146,15 @@ def test_equal_photos_have_a_finite_gradient(name: str) -> None:
     assert x.grad is not None and torch.isfinite(x.grad).all()
 
 
+@pytest.mark.parametrize("name", sorted(LOSSES))
+def test_an_anchor_without_negatives_has_a_finite_loss_and_gradient(name: str) -> None:
+    x, _ = random_batch(4, 2, 2)
+    x.requires_grad_()
+    loss = LOSSES[name](x, [Query(0, (1, 2), ())], LossOptions())
+    loss.backward()
+    assert torch.isfinite(loss) and x.grad is not None and torch.isfinite(x.grad).all()
+
+
 def test_nontrivial_average_is_not_thinned_by_easy_negatives() -> None:
     """One hard negative counts the same among a hundred easy ones."""
     anchor = torch.tensor([[1.0, 0.0, 0.0]])

@@ -159,6 +159,16 @@ def test_flight_batches_use_all_relations_of_many_photos_of_few_flights() -> Non
         }
 
 
+def test_unmatched_photos_are_negatives_where_all_pairs_were_tried() -> None:
+    scene = strip("a", 12, reach=3)
+    assert scene.unmatched(0).tolist() == [4, 5, 6, 7, 8, 9, 10, 11]
+    partly = Scene(**{**scene.__dict__, "method": "bow"})
+    assert partly.unmatched(0).tolist() == partly.apart(0).tolist() == [7, 8, 9, 10, 11]
+    weak = Scene(**{**scene.__dict__, "matches": symmetric([(0, 5, 12), (0, 6, 3)], 12)})
+    assert weak.unmatched(0).tolist() == [4, 6, 7, 8, 9, 10, 11], "12 matches are too many"
+    assert weak.matched(0).size == 0
+
+
 def test_one_scene_alone_is_refused_unless_same_flight_negatives_are_asked_for() -> None:
     with pytest.raises(InputError, match="one usable scene only"):
         Sampler(scenes(1), SamplingOptions())

@@ -129,7 +129,17 @@ def _die_after(monkeypatch: pytest.MonkeyPatch, steps: int) -> None:
     "settings",
     [
         {},
-        {"views": 2, "mining": "flight", "loss": "softmax", "keep_local": 0.5, "warm_up": 2},
+        {
+            "views": 2,
+            "upright": 0.5,
+            "mining": "flight",
+            "negatives": "unmatched",
+            "loss": "softmax",
+            "keep_local": 0.5,
+            "warm_up": 2,
+            "aggregation": "netvlad-tuned",
+            "assignment": 20.0,
+        },
         {"mining": "global", "loss": "triplet"},
         {"aggregation": "gem", "pseudo_views": 4, "teacher": "start", "frozen": "block9"},
     ],
@@ -220,6 +230,28 @@ def test_frozen_stages_stay_and_the_others_move(
     assert moved, "the later stages were trained"
     assert all(int(key.split(".")[1]) >= 5 for key in moved)
     assert not any("running" in key for key in moved), "statistics of batch norms stay"
+
+
+def test_tuned_netvlad_starts_as_netvlad_and_moves_at_its_own_rates(
+    flights: list[Scene], options: TrainOptions, tmp_path: Path
+) -> None:
+    """The layer's extra parameters do nothing at first; their rates are factors of the table."""
+    torch.manual_seed(0)
+    centres, features = torch.randn(4, 112), torch.randn(2, 112, 3, 5)
+    described = []
+    for kind in ("netvlad", "netvlad-tuned"):
+        layer = build_aggregation(112, {"kind": kind, "clusters": 4})
+        layer.init_from_centres(centres, 20.0)
+        described.append(layer(features))
+    assert torch.allclose(described[0], described[1], atol=1e-5)
+    options = change(options, aggregation="netvlad-tuned", assignment=20.0, frozen="block10")
+    tuned = Run(flights[:2], [], change(options, head_rate=2.0), tmp_path / "run")
+    factor_of = {
+        id(p): group["factor"] for group in tuned.optimizer.param_groups for p in group["params"]
+    }
+    layer = tuned.network.network.aggregation
+    assert factor_of[id(layer.projection)] == 2.0 and factor_of[id(layer.hardness_log)] == 60.0
+    assert len(factor_of) == len(list(layer.parameters()))
 
 
 @pytest.mark.parametrize("name", ["vgg16", "resnet50", LITE, "efficientnet-lite0-stage7"])

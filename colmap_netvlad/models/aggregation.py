@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import types
+from collections.abc import Mapping
 from typing import Any
 
 import faiss
@@ -24,10 +26,12 @@ class Aggregation(nn.Module):
     Attributes:
         kind: its row in `AGGREGATIONS`.
         dim: length of the vector.
+        rates: factors on the learning rate, by parameter; 1 where absent.
     """
 
     kind: str
     dim: int
+    rates: Mapping[str, float] = types.MappingProxyType({})
 
     def options(self) -> dict[str, Any]:
         """What a checkpoint needs to build the layer again, beside the channels."""
@@ -113,6 +117,65 @@ class NetVLAD(Aggregation):
         return alpha
 
 
+class TunedNetVLAD(NetVLAD):
+    """NetVLAD that a few hundred photos can tune, on a trunk that stays frozen.
+
+    Beside the paper's: a linear map of the L2-normalised features in front, started at the
+    identity; the bias b_k of eq. 16; and a weight of each cluster after intra-normalisation.
+    Scales, hardness and weights are learned as logarithms.
+
+    Attributes:
+        projection, offset, scale_log: x -> exp(scale) (projection x) + offset, (D, D), (D,), (D,).
+        hardness_log: log alpha; `assignment` holds the directions c_k / |c_k|.
+        assignment_bias: b_k, (K,).
+        weight_log: (K,).
+    """
+
+    kind = "netvlad-tuned"
+    rates = types.MappingProxyType(
+        {
+            "centres": 2.0,
+            "assignment": 2.0,
+            "assignment_bias": 10.0,
+            "hardness_log": 30.0,
+            "weight_log": 30.0,
+            "scale_log": 30.0,
+        }
+    )
+
+    def __init__(self, channels: int, clusters: int = 64) -> None:
+        super().__init__(channels, clusters)
+        self.projection = nn.Parameter(torch.eye(channels))
+        self.offset = nn.Parameter(torch.zeros(channels))
+        self.scale_log = nn.Parameter(torch.zeros(channels))
+        self.hardness_log = nn.Parameter(torch.zeros(()))
+        self.assignment_bias = nn.Parameter(torch.zeros(clusters))
+        self.weight_log = nn.Parameter(torch.zeros(clusters))
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Features (B, D, h, w) to descriptors (B, K D), cluster by cluster."""
+        with torch.autocast(features.device.type, enabled=False):
+            x = functional.normalize(features.float().flatten(2), dim=1)  # (B, D, N)
+            scale = self.scale_log.float().exp()[:, None]
+            x = functional.normalize(
+                (scale * self.projection.float()) @ x + self.offset.float()[:, None], dim=1
+            )
+            hardness = self.hardness_log.float().exp()
+            logits = hardness * (self.assignment.float() @ x)
+            assigned = torch.softmax(logits + self.assignment_bias.float()[:, None], dim=1)
+            mass = assigned.sum(dim=2, keepdim=True)  # (B, K, 1)
+            residuals = assigned @ x.transpose(1, 2) - mass * self.centres.float()  # (B, K, D)
+            residuals = functional.normalize(residuals, dim=2)
+            residuals = residuals * self.weight_log.float().exp()[:, None]
+            return functional.normalize(residuals.flatten(1), dim=1)
+
+    @torch.no_grad()
+    def init_from_centres(self, centres: Tensor, alpha: float) -> None:
+        """Set c_k, the directions of w_k, and alpha; the rest stays as it does nothing."""
+        super().init_from_centres(centres, 1.0)
+        self.hardness_log.fill_(math.log(alpha))
+
+
 class GeM(Aggregation):
     """Generalised mean (eq. 17), one learnable power p_k per feature map, started at 3."""
 
@@ -150,7 +213,7 @@ class MaxPool(Aggregation):
 
 
 AGGREGATIONS: dict[str, type[Aggregation]] = {
-    layer.kind: layer for layer in (NetVLAD, GeM, MaxPool)
+    layer.kind: layer for layer in (NetVLAD, TunedNetVLAD, GeM, MaxPool)
 }
 
 

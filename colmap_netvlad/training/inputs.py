@@ -102,8 +102,18 @@ class Photos:
                 self._bytes -= self._kept.popitem(last=False)[1].nbytes
         return pixels
 
-    def draw(self, scene: int, image: int, rng: np.random.Generator) -> View:
-        """Draw a random view of a photo, or of a pseudo-scene's cut of it."""
+    def draw(
+        self, scene: int, image: int, rng: np.random.Generator, upright: bool | None = None
+    ) -> View:
+        """Draw a random view of a photo, or of a pseudo-scene's cut of it.
+
+        Args:
+            upright: whether it is the whole photo as it stands; None: by chance.
+        """
+        if upright is None:
+            upright = rng.random() < self._options.upright
+        if upright:
+            return View(np.eye(3))
         width, height = self.scenes[scene].sizes[image].tolist()
         return draw_view(rng, (width, height), self.size, self._augmentation)
 
@@ -158,6 +168,7 @@ class KeptFeatures:
         self._photos = photos
         self._views = options.views
         self._seed = options.seed
+        self._upright = round(options.upright * options.views)
         sizes = [len(scene) for scene in photos.scenes]
         self._first = np.concatenate([[0], np.cumsum(sizes)]).astype(int)
         key = fingerprint_of_views(network, photos.scenes, options)
@@ -221,7 +232,7 @@ class KeptFeatures:
         scene = int(np.searchsorted(self._first, row, side="right")) - 1
         image = row - int(self._first[scene])
         rng = np.random.default_rng([self._seed, _KEPT_VIEWS, scene, image, view])
-        return scene, image, self._photos.draw(scene, image, rng)
+        return scene, image, self._photos.draw(scene, image, rng, upright=view < self._upright)
 
 
 def decoded_size(photo: Sequence[int], long_side: int) -> tuple[int, int]:
@@ -238,8 +249,12 @@ def fingerprint_of_views(
     network: SplitNetwork, scenes: Sequence[Scene], options: TrainOptions
 ) -> str:
     """Return a hash of all that the frozen features of views depend on."""
-    record = (options.width, options.height, options.views, options.seed, options.for_views())
-    text = repr(record) + network.frozen_fingerprint() + fingerprint_of_photos(scenes)
+    record = (options.width, options.height, options.views, options.upright, options.seed)
+    text = (
+        repr((record, options.for_views()))
+        + network.frozen_fingerprint()
+        + fingerprint_of_photos(scenes)
+    )
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 

@@ -18,9 +18,9 @@ from typing import Any
 from colmap_netvlad.errors import InputError
 from colmap_netvlad.training.augment import Augmentation, PseudoOptions
 from colmap_netvlad.training.losses import LOSSES, LossOptions
-from colmap_netvlad.training.sampling import MINING, SamplingOptions
+from colmap_netvlad.training.sampling import MINING, NEGATIVES, SamplingOptions
 
-ALPHA = {"netvlad": 1.35, "gem": 0.9, "max": 0.9}
+ALPHA = {"netvlad": 1.35, "netvlad-tuned": 1.35, "gem": 0.9, "max": 0.9}
 """Margin alpha of eq. 11 by aggregation (section 4.3.2)."""
 
 
@@ -58,6 +58,7 @@ class TrainOptions:
     views: int = setting(
         0, "Views of each photo whose frozen features are kept on disk; 0: new ones each time."
     )
+    upright: float = setting(0.0, "Share of views that are the photo itself, whole and upright.")
     rotation: float = setting(180.0, "Largest turn of a view, degrees.")
     flip: float = setting(0.5, "Probability of a mirrored view.")
     scale_min: float = setting(0.65, "Smallest share of a photo's longer side in a view.")
@@ -76,6 +77,12 @@ class TrainOptions:
     scenes_per_batch: int = setting(5, "B, the anchors of a batch, each of another scene.")
     positives: int = setting(3, "M, the positives of an anchor.")
     epsilon: int = setting(15, "A positive shares more 3D points than this with its anchor.")
+    negatives: str = setting(
+        "apart",
+        "What a negative of the same flight is: surely apart (no common points or neighbours), or"
+        " unmatched (needs exhaustively matched scenes).",
+        choices=NEGATIVES,
+    )
     hard_negatives: int = setting(2, "Negatives of an anchor in global mining.")
     flight_photos: int = setting(32, "Photos of each scene in a flight batch.")
     same_flight: int = setting(0, "Further negatives of the anchor's flight, surely apart.")
@@ -155,6 +162,7 @@ class TrainOptions:
             positives=self.positives,
             epsilon=self.epsilon,
             hard_negatives=self.hard_negatives,
+            negatives=self.negatives,
             flight_photos=self.flight_photos,
             same_flight=self.same_flight,
             pseudo_share=self.pseudo_share if self.pseudo_views else 0.0,

@@ -317,7 +317,7 @@ class Run:
             return load_network(options.start)
         trunk = load_trunk(options.trunk, Path(options.weights) if options.weights else None)
         kind = {"kind": options.aggregation}
-        clusters = {"clusters": options.clusters} if options.aggregation == "netvlad" else {}
+        clusters = {"clusters": options.clusters} if "netvlad" in options.aggregation else {}
         return GlobalDescriptor(trunk, build_aggregation(trunk.channels, kind | clusters))
 
     def _initialise(self) -> None:
@@ -361,12 +361,15 @@ class Run:
 
     def _optimizer(self) -> torch.optim.Adam:
         options = self.options
-        named = self.network.trained()
-        head = [p for name, p in named.items() if not name.startswith("trunk.")]
-        trunk = [p for name, p in named.items() if name.startswith("trunk.")]
-        groups = [{"params": trunk, "factor": 1.0}, {"params": head, "factor": options.head_rate}]
+        rates = self.network.network.aggregation.rates
+        groups: dict[float, list[torch.nn.Parameter]] = {}
+        for name, parameter in self.network.trained().items():
+            factor = 1.0
+            if not name.startswith("trunk."):
+                factor = options.head_rate * rates.get(name.removeprefix("aggregation."), 1.0)
+            groups.setdefault(factor, []).append(parameter)
         return torch.optim.Adam(
-            [group for group in groups if group["params"]],
+            [{"params": group, "factor": factor} for factor, group in groups.items()],
             lr=options.learning_rate,
             betas=(options.momentum, 0.999),
             weight_decay=options.weight_decay,

@@ -23,6 +23,8 @@ from colmap_netvlad.training.scenes import Scene
 
 MINING = ("nontrivial", "global", "flight")
 
+NEGATIVES = ("apart", "unmatched")
+
 
 @dataclass(frozen=True)
 class Query:
@@ -50,6 +52,8 @@ class SamplingOptions:
         scenes: B, the anchors of a batch, each of another scene.
         positives: M, the positives of an anchor.
         epsilon: a positive shares more than this many 3D points with its anchor (eq. 6).
+        negatives: what a negative of the same flight is: "apart" (`Scene.apart`) or "unmatched"
+            (`Scene.unmatched`).
         hard_negatives: negatives of an anchor in global mining, each of another scene.
         flight_photos: photos drawn from each scene of a flight batch.
         same_flight: further negatives of an anchor from its own flight, surely apart.
@@ -61,6 +65,7 @@ class SamplingOptions:
     scenes: int = 5
     positives: int = 3
     epsilon: int = 15
+    negatives: str = "apart"
     hard_negatives: int = 2
     flight_photos: int = 32
     same_flight: int = 0
@@ -123,7 +128,7 @@ class Sampler:
                 "from other scenes: annotate another flight, or ask for --same-flight negatives."
             )
         scene = self.scenes[only]
-        self._anchors[only] = [i for i in self._anchors[only] if len(scene.apart(i))]
+        self._anchors[only] = [i for i in self._anchors[only] if len(self._strangers(only, i))]
         if not self._anchors[only]:
             raise InputError(
                 f"The one usable scene {scene.name} has no two photos that are surely apart, so "
@@ -179,21 +184,38 @@ class Sampler:
         return Batch(tuple(builder.samples), tuple(queries))
 
     def _flight_batch(self, rng: np.random.Generator) -> Batch:
-        """Many photos of each scene, every one an anchor; negatives are those surely apart."""
+        """Many photos of each scene, every one an anchor.
+
+        Its positives share points with it and matched; larger scenes are drawn more often.
+        """
         builder = _Builder()
         queries = []
-        for scene in self._draw_scenes(rng):
+        for scene in self._draw_flights(rng):
             count = len(self.scenes[scene])
             images = np.sort(rng.permutation(count)[: self.options.flight_photos]).tolist()
             row_of = {image: builder.add(scene, image) for image in images}
             for image in images:
                 found = self._positives[scene][image].tolist()
-                positives = tuple(row_of[i] for i in found if i in row_of)
-                apart = self.scenes[scene].apart(image).tolist()
-                negatives = tuple(row_of[i] for i in apart if i in row_of)
+                matched = set(self.scenes[scene].matched(image).tolist())
+                positives = tuple(row_of[i] for i in found if i in row_of and i in matched)
+                strangers = self._strangers(scene, image).tolist()
+                negatives = tuple(row_of[i] for i in strangers if i in row_of)
                 if positives:
                     queries.append(Query(row_of[image], positives, negatives))
         return Batch(tuple(builder.samples), tuple(queries))
+
+    def _draw_flights(self, rng: np.random.Generator) -> list[int]:
+        """Scenes with a probability that goes with the square root of their photos."""
+        usable = list(self._anchors)
+        weights = np.sqrt([len(self.scenes[scene]) for scene in usable])
+        count = min(self.options.scenes, len(usable))
+        drawn = rng.choice(len(usable), size=count, replace=False, p=weights / weights.sum())
+        return [usable[i] for i in drawn]
+
+    def _strangers(self, scene: int, image: int) -> NDArray[np.intp]:
+        """The possible negatives of an image in its own flight."""
+        one = self.scenes[scene]
+        return one.apart(image) if self.options.negatives == "apart" else one.unmatched(image)
 
     def _draw_scenes(self, rng: np.random.Generator) -> list[int]:
         """B scenes without repetition (fewer where there are fewer)."""
@@ -219,7 +241,7 @@ class Sampler:
     def _draw_apart(self, rng: np.random.Generator, scene: int, anchor: int) -> list[int]:
         if not self.options.same_flight:
             return []
-        apart = self.scenes[scene].apart(anchor)
+        apart = self._strangers(scene, anchor)
         return [int(apart[i]) for i in rng.permutation(len(apart))[: self.options.same_flight]]
 
 

@@ -42,6 +42,9 @@ FORMAT = "colmap-netvlad annotation"
 VERSION = 1
 ANNOTATION = "annotation.npz"
 
+HARDLY_MATCHES = 8
+"""With fewer verified matches than this a pair shows different ground: by chance there are some."""
+
 
 @dataclass(frozen=True, eq=False)
 class Observations:
@@ -138,6 +141,26 @@ class Scene:
         for neighbour in first:
             known[near.indices[near.indptr[neighbour] : near.indptr[neighbour + 1]]] = False
         return np.flatnonzero(known)
+
+    def matched(self, image: int) -> NDArray[np.intp]:
+        """Return the images with more than 15 verified matches with `image`."""
+        row = slice(self.matches.indptr[image], self.matches.indptr[image + 1])
+        return self.matches.indices[row][self.matches.data[row] > CORRECT_MATCHES].astype(np.intp)
+
+    def unmatched(self, image: int) -> NDArray[np.intp]:
+        """Return the images that hardly match `image` (< 8 verified matches, no common points).
+
+        That says something of scenes whose pairs were all tried; of others it is `apart`.
+        """
+        if self.method != "exhaustive":
+            return self.apart(image)
+        strange = np.ones(len(self), bool)
+        strange[image] = False
+        row = slice(self.matches.indptr[image], self.matches.indptr[image + 1])
+        strange[self.matches.indices[row][self.matches.data[row] >= HARDLY_MATCHES]] = False
+        shared = self.common_points
+        strange[shared.indices[shared.indptr[image] : shared.indptr[image + 1]]] = False
+        return np.flatnonzero(strange)
 
     def correct_pairs(self) -> dict[Pair, int]:
         """Return the verified matches of the scene's correct pairs (> 15) by image names."""
