@@ -269,8 +269,7 @@ def merge_clusters(
     finished = {path: _numbered(path) for path in _numbered(state)}
     for path, models in finished.items():
         report.clusters[int(path.name)].models = [_registered(model) for model in models]
-    missing = sum(cluster.images for cluster in report.clusters)
-    with progress.step("Merging and adjusting", missing) as bar:
+    with progress.step("Merging and adjusting (%)", 100) as bar:
         job = workers.Job(
             merge_models,
             (
@@ -317,6 +316,14 @@ def merge_models(
     cache = load_cache(database)
     pipeline = pipeline_options(options, colors=False)
     have: set[int] = set()
+    told_percent = 0
+
+    def reached(share: float) -> None:
+        nonlocal told_percent
+        advance(max(0, round(100 * share) - told_percent))
+        told_percent = max(told_percent, round(100 * share))
+
+    reached(0.05)
     members: list[list[str]] = []
     refused: list[tuple[str, str]] = []
     joined_later = 0
@@ -325,7 +332,7 @@ def merge_models(
         if len(group.model.poses.keys() - have) < options.min_model_size:
             continue
         reconstruction = rebuild(group.model, cache)
-        refine(reconstruction, cache, pipeline, lambda: advance(1))
+        refine(reconstruction, cache, pipeline, reached)
         registered = set(reconstruction.reg_image_ids())
         if len(registered - have) < options.min_model_size:
             continue
@@ -337,7 +344,6 @@ def merge_models(
         target.mkdir()
         reconstruction.write(target)
         members.append(group.members)
-        advance(len(group.model.poses))
     told = {"members": members, "refused": refused, "joined_later": joined_later}
     (folder / "merge.json").write_text(json.dumps(told), encoding="utf-8")
 

@@ -69,7 +69,7 @@ def refine(
     reconstruction: pycolmap.Reconstruction,
     cache: pycolmap.DatabaseCache,
     options: pycolmap.IncrementalPipelineOptions,
-    registered: Callable[[], None],
+    reached: Callable[[float], None],
 ) -> None:
     """Adjust a merged model and register the images it misses, in place.
 
@@ -77,7 +77,7 @@ def refine(
     anything is filtered; tracks are then completed and merged across them.
 
     Args:
-        registered: called for each image registered.
+        reached: told the share of the work that is done, 0..1, as far as it is known.
     """
     mapper = pycolmap.IncrementalMapper(cache)
     mapper.begin_reconstruction(reconstruction)
@@ -85,6 +85,7 @@ def refine(
     robust.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     robust.ceres.solver_options.max_num_iterations = SEAM_ITERATIONS
     mapper.adjust_global_bundle(options.get_mapper(), robust)
+    reached(0.3)
     mapper.iterative_global_refinement(
         MAX_REFINEMENTS,
         options.ba_global_max_refinement_change,
@@ -93,13 +94,13 @@ def refine(
         options.get_triangulation(),
     )
     mapper.filter_frames(options.get_mapper())
+    reached(0.9)
     if reconstruction.num_reg_images() < cache.num_images():
         # COLMAP's own loop: register, triangulate, adjust locally, adjust globally in the end.
         # It begins the reconstruction anew; ending it before would remove the missed images.
         pipeline = pycolmap.IncrementalPipeline(options, cache, pycolmap.ReconstructionManager())
-        next_image = pycolmap.IncrementalPipelineCallback.NEXT_IMAGE_REG_CALLBACK
-        pipeline.add_callback(next_image.value, registered)
         mapper = pycolmap.IncrementalMapper(cache)
         pipeline.reconstruct_sub_model(mapper, options.get_mapper(), reconstruction)
     mapper.end_reconstruction(False)
     reconstruction.update_point_3d_errors()
+    reached(1.0)
