@@ -102,9 +102,9 @@ def _map(
 ) -> list[pycolmap.Reconstruction]:
     """Run a mapper that cannot be cancelled in a worker, which Ctrl-C ends."""
     with model_folder(output) as folder:
-        with progress.step(f"Mapping {how}", 0) as bar:
-            job = workers.Job(function, (database, images, folder, options))
-            (outcome,) = workers.run([job], 1, bar.advance)
+        progress.console.print(f"Mapping {how}; COLMAP tells no progress of this mapper.")
+        job = workers.Job(function, (database, images, folder, options))
+        (outcome,) = workers.run([job], 1, lambda count: None)
         if outcome.fault is not None:
             raise InputError(f"COLMAP could not map {how}: {outcome.fault}.")
         return [pycolmap.Reconstruction(path) for path in sorted(folder.iterdir()) if path.is_dir()]
