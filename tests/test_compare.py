@@ -19,10 +19,12 @@ from colmap_netvlad.compare import CompareOptions, compare, models, pipeline, po
 from colmap_netvlad.compare.result import Comparison, write_json
 from colmap_netvlad.compare.workspace import file_name, open_workspace, read_facts
 from colmap_netvlad.errors import EXIT_PARTIAL, InputError
+from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.project import Project
 
 METHODS = ("vlad", "random")
-OPTIONS = CompareOptions(ks=(2, 4))
+# One thread: COLMAP adds in the order its threads finish, so only that repeats the last digits.
+OPTIONS = CompareOptions(ks=(2, 4), mapping=MappingOptions(threads=1))
 FAST = replace(OPTIONS, reconstruct=False)
 
 Make = Callable[..., Project]
@@ -110,7 +112,7 @@ def test_each_distinct_pair_is_matched_once(whole):
     assert comparison.methods[0].seconds_match == pytest.approx(timed[1])
 
 
-def test_figures_equal_those_of_a_method_run_alone(whole, project_copy: Make):
+def test_figures_equal_those_of_a_method_run_alone(no_page, whole, project_copy: Make):
     together = next(m for m in timeless(whole[0]).methods if m.name == "vlad")
     alone = timeless(compare(project_copy(), ["vlad"], OPTIONS)[0]).methods[0]
     # Recall, precision and single finds depend on the reference, not on the method alone.
@@ -120,7 +122,7 @@ def test_figures_equal_those_of_a_method_run_alone(whole, project_copy: Make):
     assert together.model.registered > 2
 
 
-def test_models_made_earlier_are_shown_without_reconstruct(whole, project_copy: Make):
+def test_models_made_earlier_are_shown_without_reconstruct(no_page, whole, project_copy: Make):
     _, folder, _ = whole
     project = project_copy()
     shutil.copytree(folder / "project-compare", project.folder / "project-compare")
@@ -137,6 +139,12 @@ def test_a_comparison_in_which_every_method_fails_is_still_written(project_copy:
     comparison, workspace = compare(project_copy(), METHODS, OPTIONS)
     assert comparison.incomplete == ["vlad: Nothing works.", "random: Nothing works."]
     assert "Nothing works." in workspace.html.read_text()
+
+
+@pytest.fixture
+def no_page(monkeypatch) -> None:
+    """Leave the page out where a test is not about it: it is most of a small comparison's time."""
+    monkeypatch.setattr("colmap_netvlad.report.page.render_page", lambda *args: "")
 
 
 class Killed(BaseException):
@@ -168,7 +176,7 @@ def kill_on_call(monkeypatch, module, name: str, call: int, after: bool = False)
     ],
 )
 def test_a_killed_run_goes_on_to_the_same_figures(
-    unbroken, project_copy: Make, monkeypatch, module, name, call, after
+    no_page, unbroken, project_copy: Make, monkeypatch, module, name, call, after
 ):
     project = project_copy(name="killed")
     with monkeypatch.context() as patch:
@@ -181,7 +189,9 @@ def test_a_killed_run_goes_on_to_the_same_figures(
         assert any(method.match_measured < 1 for method in again.methods)
 
 
-def test_a_run_killed_while_mapping_keeps_the_models_it_has(whole, project_copy: Make, monkeypatch):
+def test_a_run_killed_while_mapping_keeps_the_models_it_has(
+    no_page, whole, project_copy: Make, monkeypatch
+):
     _, folder, _ = whole
     copy = project_copy(name="mapping")
     output = copy.folder / "project-compare"
@@ -197,7 +207,7 @@ def test_a_run_killed_while_mapping_keeps_the_models_it_has(whole, project_copy:
     assert timeless(again) == timeless(whole[0])
 
 
-def test_methods_are_added_to_an_earlier_comparison(project_copy: Make, monkeypatch):
+def test_methods_are_added_to_an_earlier_comparison(no_page, project_copy: Make, monkeypatch):
     project = project_copy()
     compare(project, ["vlad"], FAST)
     ranked = []
@@ -233,7 +243,9 @@ def test_a_failing_method_is_reported_and_the_others_finish(project_copy: Make, 
     assert "RuntimeError: out of luck" in page
 
 
-def test_missing_weights_leave_the_other_methods(project_copy: Make, monkeypatch, tmp_path):
+def test_missing_weights_leave_the_other_methods(
+    no_page, project_copy: Make, monkeypatch, tmp_path
+):
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "nothing"))
     comparison, _ = compare(project_copy(), ["netvlad", "vlad"], FAST)
     assert "download" in comparison.methods[0].failed
@@ -269,7 +281,7 @@ def test_failing_mapping_is_reported_and_tried_again(project_copy: Make, monkeyp
     assert "no image could be registered" in workspace.html.read_text()
 
 
-def test_a_long_exhaustive_matching_is_asked_about(project_copy: Make, monkeypatch):
+def test_a_long_exhaustive_matching_is_asked_about(no_page, project_copy: Make, monkeypatch):
     project = project_copy()
     monkeypatch.setattr(pipeline, "ASK_ABOVE", 0.0)
     asked = []
@@ -280,7 +292,7 @@ def test_a_long_exhaustive_matching_is_asked_about(project_copy: Make, monkeypat
     assert comparison.methods[0].best_k.pairs == 66
 
 
-def test_pairs_of_the_cost_sample_are_not_in_the_union(unbroken, project_copy: Make):
+def test_pairs_of_the_cost_sample_are_not_in_the_union(no_page, unbroken, project_copy: Make):
     project = project_copy(name="sampled")
     facts = read_facts(project.database)
     workspace = open_workspace(project.folder / "project-compare", project.database, facts)
@@ -288,7 +300,7 @@ def test_pairs_of_the_cost_sample_are_not_in_the_union(unbroken, project_copy: M
     assert timeless(compare(project, METHODS, FAST)[0]) == unbroken
 
 
-def test_a_folder_of_another_project_is_refused(project_copy: Make):
+def test_a_folder_of_another_project_is_refused(no_page, project_copy: Make):
     one, other = project_copy(name="one"), project_copy(name="other")
     compare(one, ["random"], FAST)
     with closing(sqlite3.connect(other.database)) as connection, connection:
@@ -333,7 +345,7 @@ def test_a_database_without_features_is_refused(project_copy: Make):
         compare(project, ["random"], FAST)
 
 
-def test_a_method_gone_since_is_a_failed_one(project_copy: Make, monkeypatch):
+def test_a_method_gone_since_is_a_failed_one(no_page, project_copy: Make, monkeypatch):
     project = project_copy()
     _, workspace = compare(project, ["random"], FAST)
     workspace.add_methods(["/gone/model.safetensors"])
