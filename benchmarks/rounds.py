@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -52,7 +53,7 @@ def spend(
     return set(last)
 
 
-def table(project: Project, methods: list[str], ks: list[int], gps: str | None) -> None:
+def table(project: Project, methods: list[str], ks: list[int], options: RetrievalOptions) -> None:
     names, truth = image_names(project.database), truth_of(project)
     total = correct(set(truth), truth)
     print(f"\n{project.database.stem}: {len(names)} images, {total:,} true pairs")
@@ -61,7 +62,7 @@ def table(project: Project, methods: list[str], ks: list[int], gps: str | None) 
     )
     print("|---|---|---|---|---|---|---|---|")
     for method in methods:
-        ranking = rank(project, method, RetrievalOptions(k=len(names) - 1, gps=gps))
+        ranking = rank(project, method, replace(options, k=len(names) - 1))
         similarity = similarity_matrix(ranking)
         for k in ks:
             chosen = one_round(ranking, k)
@@ -92,9 +93,10 @@ def main() -> None:
     parser.add_argument("--gps", help="auto, off or require")
     parser.add_argument("scenes", nargs="+", metavar="DATABASE:PHOTOS")
     arguments = parser.parse_args()
+    options = RetrievalOptions(gps=arguments.gps)
     for scene in arguments.scenes:
         ks = [int(k) for k in arguments.k.split(",")]
-        table(read_scene(scene), arguments.methods.split(","), ks, arguments.gps)
+        table(read_scene(scene), arguments.methods.split(","), ks, options)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from scipy import sparse
 
-from colmap_netvlad.connect import components, connecting_pairs
+from colmap_netvlad.connect import TRIES_PER_LINK, components, connecting_pairs
 from colmap_netvlad.database import image_names, open_database
 from colmap_netvlad.errors import InputError
 from colmap_netvlad.matching import MatchOptions, MatchReport, match_pairs
@@ -27,7 +27,7 @@ from colmap_netvlad.retrieval.store import Store
 from colmap_netvlad.rounds import IndexPair, next_round, split_budget
 
 CONNECTING_SHARE = 0.05
-"""Extra budget for pairs between components, as a share of the budget."""
+"""Extra budget for pairs between components, as a share of the budget (at least one link's)."""
 
 MOST_LISTED = 10
 """Images listed by name for each component apart."""
@@ -244,7 +244,7 @@ class _Run:
                 components(len(self.ids), _correct(verified)),
                 verified,
                 self.ranking.names,
-                max(1, round(CONNECTING_SHARE * self.budget)),
+                max(TRIES_PER_LINK, round(CONNECTING_SHARE * self.budget)),
             )
             self.plan.save()
         seconds = time.perf_counter() - start

@@ -49,12 +49,12 @@ class Weights:
 
 
 FITTED = Weights(
-    similarity=0.6,
-    agreeing=0.4,
-    failing=-0.4,
-    rate=1.5,
-    support=0.3,
-    intercept=-1.5,
+    similarity=0.162,
+    agreeing=1.28,
+    failing=-3.84,
+    rate=-0.39,
+    support=0.482,
+    intercept=-2.08,
 )
 
 
@@ -154,8 +154,12 @@ def next_round(
 
     With nothing tested yet this is the ranking itself, round-robin over the images. Later,
     pairs less probable than `LEAST_PROBABILITY` are not worth matching: the list is shorter than
-    the budget, or empty, where nothing promising is left.
+    the budget, or empty, where nothing promising is left or fewer than that share of what was
+    tested verified.
     """
+    correct = sum(count > CORRECT_MATCHES for count in verified.values())
+    if correct < LEAST_PROBABILITY * len(verified):
+        return []
     candidates = find_candidates(similarity, verified)
     if not verified:
         value = candidates.evidence[:, 0]

@@ -11,7 +11,7 @@ beside them.
 from __future__ import annotations
 
 import argparse
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -48,11 +48,11 @@ def truth_of(project: Project) -> dict[IndexPair, int]:
 
 
 def examples(
-    project: Project, method: str, gps: str | None
+    project: Project, method: str, options: RetrievalOptions
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     names = image_names(project.database)
     depth = min(fusion_depth(20), len(names) - 1)
-    ranking = rank(project, method, RetrievalOptions(k=depth, gps=gps))
+    ranking = rank(project, method, replace(options, k=depth))
     similarity, truth = similarity_matrix(ranking), truth_of(project)
     evidence, labels = [], []
     for budget in BUDGETS:
@@ -83,13 +83,15 @@ def fit(scenes: list[tuple[NDArray[np.float64], NDArray[np.bool_]]]) -> Weights:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--method", default="hybrid")
+    parser.add_argument("--model", help="deep model of hybrid")
     parser.add_argument("--gps", help="auto, off or require")
     parser.add_argument("scenes", nargs="+", metavar="DATABASE:PHOTOS")
     arguments = parser.parse_args()
+    options = RetrievalOptions(model=arguments.model, gps=arguments.gps)
     projects = [read_scene(scene) for scene in arguments.scenes]
     data = []
     for project in projects:
-        data.append(examples(project, arguments.method, arguments.gps))
+        data.append(examples(project, arguments.method, options))
         evidence, labels = data[-1]
         print(f"{project.database.stem}: {len(evidence):,} examples, {labels.mean():.0%} verify")
     weights = fit(data)

@@ -170,11 +170,12 @@ def test_a_later_round_stops_where_nothing_is_promising() -> None:
     ranking = from_lists(
         tuple("abcd"), [[(j, 1.0) for j in range(4) if j != i] for i in range(4)], "flat"
     )
-    tested = {pair: 0 for pair in combinations(range(4), 2) if pair != (2, 3)}
-    hopeless = next_round(similarity_matrix(ranking), tested, ranking.names, 10)
-    assert len(hopeless) <= 1
-    everything = tested | {(2, 3): 0}
-    assert next_round(similarity_matrix(ranking), everything, ranking.names, 10) == []
+    similarity = similarity_matrix(ranking)
+    failed = {(0, 1): 0, (0, 2): 0, (1, 2): 0}
+    assert next_round(similarity, failed, ranking.names, 10) == []
+    all_tested = dict.fromkeys(combinations(range(4), 2), 80)
+    assert next_round(similarity, all_tested, ranking.names, 10) == []
+    assert next_round(similarity, {(0, 1): 80}, ranking.names, 10) != []
 
 
 def test_an_image_with_two_candidates_is_not_starved_by_a_crowd() -> None:

@@ -15,7 +15,7 @@ from colmap_netvlad.retrieval.ranking import Ranking
 if TYPE_CHECKING:
     from colmap_netvlad.retrieval.methods import RetrievalOptions
 
-DEEP_WEIGHT = 0.7
+DEEP_WEIGHT = 1.0
 VLAD_WEIGHT = 1.0
 """Shares of the two rankings, chosen on the training flights (`scripts/fit_hybrid.py`)."""
 
