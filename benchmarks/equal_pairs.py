@@ -1,0 +1,131 @@
+"""One round, fused, in rounds: what the same number of matched pairs gives.
+
+    python benchmarks/equal_pairs.py --k 10 SCENE.db:PHOTOS [SCENE.db:PHOTOS ...]
+
+Each flight's database holds every pair matched. Every approach spends the same number of pairs,
+that of the union of each image's k nearest under `hybrid`; matches are copied from the database
+instead of made again (the same result), and a model is mapped from them. Matching minutes are
+the number of pairs times the seconds of a pair, measured on a sample of the same pairs.
+Databases are only read.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+
+from colmap_netvlad.compare.models import copy_pairs
+from colmap_netvlad.database import copy_database, image_names
+from colmap_netvlad.mapping.incremental import map_incremental
+from colmap_netvlad.mapping.options import MappingOptions
+from colmap_netvlad.mapping.summary import combine
+from colmap_netvlad.matching import match_pairs
+from colmap_netvlad.metrics import CORRECT_MATCHES, as_pair
+from colmap_netvlad.models.catalogue import DEFAULT
+from colmap_netvlad.project import Project
+from colmap_netvlad.retrieval.fusion import similarity_matrix
+from colmap_netvlad.retrieval.methods import RetrievalOptions, rank
+from colmap_netvlad.rounds import IndexPair, find_candidates, replay, take_turns
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
+from fit_rounds import read_scene, truth_of
+
+ROUNDS = 3
+SAMPLE = 60
+"""Pairs matched anew to measure the seconds of one."""
+
+APPROACHES = (
+    ("BoW, one round", "bow", "off", 1),
+    ("VLAD, one round", "vlad", "off", 1),
+    (f"{DEFAULT}, one round", DEFAULT, "off", 1),
+    ("hybrid without GPS, one round", "hybrid", "off", 1),
+    (f"hybrid without GPS, {ROUNDS} rounds", "hybrid", "off", ROUNDS),
+    ("hybrid, one round", "hybrid", "auto", 1),
+    (f"hybrid, {ROUNDS} rounds", "hybrid", "auto", ROUNDS),
+)
+
+
+def seconds_of_a_pair(project: Project, pairs: list[tuple[str, str]]) -> float:
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder, "sample.db")
+        copy_database(project.database, copy, matches=False)
+        sample = pairs[:: max(1, len(pairs) // SAMPLE)]
+        return match_pairs(copy, sample).seconds / len(sample)
+
+
+def model_row(project: Project, pairs: list[tuple[str, str]]) -> tuple[str, float]:
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder, "pairs.db")
+        copy_pairs(project.database, copy, {as_pair(*pair) for pair in pairs})
+        start = time.monotonic()
+        models = map_incremental(copy, None, Path(folder, "sparse"), MappingOptions())
+        seconds = time.monotonic() - start
+        if not models:
+            return "0 | 0 | - | 0", seconds
+        total = combine(models)
+        return (
+            f"{total.registered} | {total.points:,} | {total.mean_reprojection_error:.3f} "
+            f"| {len(models)}",
+            seconds,
+        )
+
+
+def measure(project: Project, k: int) -> None:
+    names, truth = image_names(project.database), truth_of(project)
+    total = sum(count > CORRECT_MATCHES for count in truth.values())
+    options = RetrievalOptions(k=len(names) - 1)
+    rankings = {
+        (method, gps): rank(project, method, replace(options, gps=gps))
+        for _, method, gps, _ in APPROACHES
+    }
+    hybrid = rankings["hybrid", "auto"]
+    budget = len(
+        {
+            (min(i, j), max(i, j))
+            for i, row in enumerate(hybrid.partners[:, :k].tolist())
+            for j in row
+        }
+    )
+    per_pair: float | None = None
+    print(f"\n{project.database.stem}: {len(names)} images, {total:,} true pairs, k = {k}")
+    print(
+        "| approach | pairs | accuracy | recall | registered | points | error px | models "
+        "| matching min | mapping min |"
+    )
+    print("|---|---|---|---|---|---|---|---|---|---|")
+    for title, method, gps, rounds in APPROACHES:
+        similarity = similarity_matrix(rankings[method, gps])
+        if rounds == 1:
+            left = find_candidates(similarity, {})
+            chosen: list[IndexPair] = take_turns(
+                left.first, left.second, left.evidence[:, 0], names, budget
+            )
+        else:
+            *_, tested = replay(similarity, truth, names, budget, rounds)
+            chosen = list(tested)
+        correct = sum(truth.get(pair, 0) > CORRECT_MATCHES for pair in chosen)
+        pairs = [(names[i], names[j]) for i, j in chosen]
+        per_pair = per_pair or seconds_of_a_pair(project, pairs)
+        figures, seconds = model_row(project, pairs)
+        print(
+            f"| {title} | {len(pairs):,} | {correct / len(pairs):.1%} | {correct / total:.1%} "
+            f"| {figures} | {per_pair * len(pairs) / 60:.1f} | {seconds / 60:.1f} |",
+            flush=True,
+        )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--k", type=int, default=10)
+    parser.add_argument("scenes", nargs="+", metavar="DATABASE:PHOTOS")
+    arguments = parser.parse_args()
+    for scene in arguments.scenes:
+        measure(read_scene(scene), arguments.k)
+
+
+if __name__ == "__main__":
+    main()
