@@ -86,5 +86,5 @@ CATALOGUE: dict[str, ModelEntry] = {
     )
 }
 
-DEFAULT = "netvlad-imagenet"
+DEFAULT = "netvlad-lite-imagenet"
 """The model of `pairs` where no method is named."""
