@@ -10,7 +10,7 @@ from pathlib import Path
 from colmap_netvlad.connect import components
 from colmap_netvlad.database import image_names, open_database
 from colmap_netvlad.errors import InputError
-from colmap_netvlad.models.catalogue import DEFAULT
+from colmap_netvlad.models.catalogue import CATALOGUE, DEFAULT
 from colmap_netvlad.pairs import (
     FORMATS,
     ImagePair,
@@ -48,6 +48,7 @@ class PairsReport:
         colmap_list: the list for COLMAP, where it cannot hold all pairs and so differs from
             `output`; else None.
         unwritable: image names that COLMAP's list cannot express.
+        has_features: whether the database has local features, which `hybrid` uses as well.
     """
 
     ranking: Ranking
@@ -56,6 +57,7 @@ class PairsReport:
     output: Path
     colmap_list: Path | None
     unwritable: list[str]
+    has_features: bool = False
 
 
 def make_pairs(
@@ -101,7 +103,17 @@ def make_pairs(
     if unwritable:
         colmap_list, output = output, output.with_suffix(".csv")
         write_pairs(output, pairs, "csv")
-    return PairsReport(ranking, pairs, _components(ranking, pairs), output, colmap_list, unwritable)
+    with open_database(project.database) as database:
+        has_features = bool(database.descriptor_counts())
+    return PairsReport(
+        ranking,
+        pairs,
+        _components(ranking, pairs),
+        output,
+        colmap_list,
+        unwritable,
+        has_features,
+    )
 
 
 def _rank_by_rules(
@@ -153,6 +165,11 @@ def summary(project: Project, report: PairsReport) -> list[str]:
             f"Warning      {report.colmap_list} lacks the pairs of {len(report.unwritable)} "
             f"images: COLMAP's list cannot hold names such as {report.unwritable[0]!r}; "
             f"{report.output.name} has all pairs, and the next command reads it."
+        )
+    if report.has_features and ranking.method in CATALOGUE:
+        lines.append(
+            "Better       --method hybrid adds the database's SIFT features, and GPS where there "
+            "is any, for little time"
         )
     return [*lines, f"Next         {_next_command(project, report)}"]
 
