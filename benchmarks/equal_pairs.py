@@ -24,7 +24,13 @@ from colmap_netvlad.mapping.incremental import map_incremental
 from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.mapping.summary import combine
 from colmap_netvlad.matching import match_pairs
-from colmap_netvlad.metrics import CORRECT_MATCHES, as_pair
+from colmap_netvlad.metrics import (
+    CORRECT_MATCHES,
+    as_pair,
+    correct_pairs,
+    mean_average_precision,
+    verified_by_name,
+)
 from colmap_netvlad.models.catalogue import DEFAULT
 from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval.fusion import similarity_matrix
@@ -74,10 +80,11 @@ def model_row(project: Project, pairs: list[tuple[str, str]]) -> tuple[str, floa
         )
 
 
-def measure(project: Project, k: int) -> None:
+def measure(project: Project, k: int, vocab_tree: Path | None) -> None:
     names, truth = image_names(project.database), truth_of(project)
     total = sum(count > CORRECT_MATCHES for count in truth.values())
-    options = RetrievalOptions(k=len(names) - 1)
+    correct_names = correct_pairs(verified_by_name(project.database))
+    options = RetrievalOptions(k=len(names) - 1, vocab_tree=vocab_tree)
     rankings = {
         (method, gps): rank(project, method, replace(options, gps=gps))
         for _, method, gps, _ in APPROACHES
@@ -93,13 +100,15 @@ def measure(project: Project, k: int) -> None:
     per_pair: float | None = None
     print(f"\n{project.database.stem}: {len(names)} images, {total:,} true pairs, k = {k}")
     print(
-        "| approach | pairs | accuracy | recall | registered | points | error px | models "
+        "| approach | mAP | pairs | accuracy | recall | registered | points | error px | models "
         "| matching min | mapping min |"
     )
-    print("|---|---|---|---|---|---|---|---|---|---|")
+    print("|---|---|---|---|---|---|---|---|---|---|---|")
     for title, method, gps, rounds in APPROACHES:
         similarity = similarity_matrix(rankings[method, gps])
+        precision = "-"
         if rounds == 1:
+            precision = f"{mean_average_precision(rankings[method, gps], correct_names):.1%}"
             left = find_candidates(similarity, {})
             chosen: list[IndexPair] = take_turns(
                 left.first, left.second, left.evidence[:, 0], names, budget
@@ -112,7 +121,8 @@ def measure(project: Project, k: int) -> None:
         per_pair = per_pair or seconds_of_a_pair(project, pairs)
         figures, seconds = model_row(project, pairs)
         print(
-            f"| {title} | {len(pairs):,} | {correct / len(pairs):.1%} | {correct / total:.1%} "
+            f"| {title} | {precision} | {len(pairs):,} "
+            f"| {correct / len(pairs):.1%} | {correct / total:.1%} "
             f"| {figures} | {per_pair * len(pairs) / 60:.1f} | {seconds / 60:.1f} |",
             flush=True,
         )
@@ -121,10 +131,11 @@ def measure(project: Project, k: int) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--k", type=int, default=10)
+    parser.add_argument("--vocab-tree", type=Path, help="the flight's tree, to save building it")
     parser.add_argument("scenes", nargs="+", metavar="DATABASE:PHOTOS")
     arguments = parser.parse_args()
     for scene in arguments.scenes:
-        measure(read_scene(scene), arguments.k)
+        measure(read_scene(scene), arguments.k, arguments.vocab_tree)
 
 
 if __name__ == "__main__":
