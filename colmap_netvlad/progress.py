@@ -48,12 +48,12 @@ class _Log:
         if now - self._said < LOG_SECONDS:
             return
         self._said = now
-        left = (now - self._start) * (self._total - self._done) / max(self._done, 1)
-        print(
-            f"{self._title} {self._done}/{self._total}, about {left / 60:.1f} min to go",
-            file=sys.stderr,
-            flush=True,
-        )
+        minutes = (now - self._start) / 60
+        line = f"{self._title}, {minutes:.1f} min so far"
+        if self._total > 0 and self._done:
+            left = minutes * (self._total - self._done) / self._done
+            line = f"{self._title} {self._done}/{self._total}, about {left:.1f} min to go"
+        print(line, file=sys.stderr, flush=True)
 
 
 class _Bar:
