@@ -40,9 +40,10 @@ MODELS = {
         Model("NetVLAD", "vgg16", "netvlad", "conv5_2"),
         Model("GeM", "vgg16", "gem", "conv5_2"),
         Model("MIRorR", "resnet50", "max", "layer3"),
-        # Where no ImageNet weights of ResNet-50 can be had, max pooling on the laptop's trunk.
-        Model("MIRorR (Lite0)", "efficientnet-lite0-stage7", "max", "block14"),
+        # The laptop's trunk, for all three: no ImageNet weights of ResNet-50 come with us.
+        Model("MIRorR (Lite0)", "efficientnet-lite0-stage5", "max", "block9"),
         Model("NetVLAD (Lite0)", "efficientnet-lite0-stage5", "netvlad", "block9"),
+        Model("GeM (Lite0)", "efficientnet-lite0-stage5", "gem", "block9"),
     )
 }
 
@@ -118,7 +119,7 @@ def main(
                 rotations=rotations,
             )
             folder = output / f"{name}-{loss}-{mining}".replace(" ", "-")
-            report = train(training, validation, options, folder)
+            report = train(training, validation, options, folder, cache=output / "cache")
             rows.append((name, loss, mining, report))
             write_atomically(output / "grid.md", table(rows, options, len(training)))
     click.echo((output / "grid.md").read_text(encoding="utf-8"), nl=False)

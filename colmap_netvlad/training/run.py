@@ -79,6 +79,7 @@ def train(
     device: str | None = None,
     name: str | None = None,
     metadata: dict[str, Any] | None = None,
+    cache: Path | None = None,
 ) -> TrainReport:
     """Train a network; a run that was killed goes on from its last checkpoint.
 
@@ -90,6 +91,8 @@ def train(
         device: cpu, cuda, ...; None takes the fastest there is. On CUDA in mixed precision.
         name: what the model calls itself; default: the folder's name.
         metadata: more for the model's card (command, commit, licence).
+        cache: folder of frozen features, which runs on the same photos may share; default:
+            `<output>/cache`.
 
     Raises:
         InputError: a training scene is a validation scene as well or shares a photo with one,
@@ -97,7 +100,16 @@ def train(
             is not a number, or the disk is full.
     """
     check_disjoint([*scenes, *validation])
-    run = Run(scenes, validation, options, output, device=device, name=name, metadata=metadata)
+    run = Run(
+        scenes,
+        validation,
+        options,
+        output,
+        device=device,
+        name=name,
+        metadata=metadata,
+        cache=cache,
+    )
     return run.go()
 
 
@@ -130,6 +142,7 @@ class Run:
         device: str | None = None,
         name: str | None = None,
         metadata: dict[str, Any] | None = None,
+        cache: Path | None = None,
     ) -> None:
         self.options = options
         self.output = output
@@ -145,7 +158,7 @@ class Run:
         saved = self._load_checkpoint()
         self.network = SplitNetwork(self._build(saved), options.frozen).to(self.device)
         self.network.train(False)
-        cache = output / "cache"
+        cache = cache or output / "cache"
         self.validation = Validation(validation, options.long_side, options.rotations, cache)
         self.inputs: Inputs = (
             KeptFeatures(self.photos, self.network, options, cache)
