@@ -313,7 +313,7 @@ class Run:
             "name": self.name,
             "long_side": self.options.long_side,
             "rotations": self.options.rotations,
-            "recipe": self.options.as_dict(),
+            "recipe": _portable(self.options.as_dict()),
             "epoch": self.epoch,
             "data": {scene.name: len(scene) for scene in self.real_scenes},
             "validation": self.validation_scenes,
@@ -485,3 +485,9 @@ def _batch(plain: list[Any]) -> Batch:
         tuple((scene, image) for scene, image in samples),
         tuple(Query(a, tuple(positives), tuple(negatives)) for a, positives, negatives in queries),
     )
+
+
+def _portable(recipe: dict[str, Any]) -> dict[str, Any]:
+    """Return a recipe with the names of its files, not where they lay on this machine."""
+    files = ("weights", "start", "teacher")
+    return recipe | {name: Path(recipe[name]).name for name in files if recipe.get(name)}
