@@ -168,9 +168,7 @@ def normalised_cut(weights: sparse.csr_array, left: NDArray[np.bool_]) -> float:
     return float(normalised_cuts(weights, order)[int(left.sum()) - 1])
 
 
-def _polish(
-    weights: sparse.csr_array, left: NDArray[np.bool_], smallest: int
-) -> NDArray[np.bool_]:
+def _polish(weights: sparse.csr_array, left: NDArray[np.bool_], smallest: int) -> NDArray[np.bool_]:
     """Move the image to the other side that lowers Ncut most, until none does.
 
     Neither side becomes smaller than `smallest`.
