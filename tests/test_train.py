@@ -190,6 +190,7 @@ def test_a_run_trains_validates_and_leaves_a_model_that_runs(
     assert card["validation"] == ["flight3"] and set(card["data"]) == {"flight1", "flight2"}
     assert card["recipe"]["learning_rate"] == options.learning_rate and card["licence"] == "X"
     assert set(card["scores"]) == {"flight3"}
+    assert card["recipe"]["weights"] == "lite.safetensors", "no folder of this machine"
     described = load_model(report.best, "cpu").describe(np.zeros((1, 3, 64, 96), np.uint8))
     assert described.shape == (1, 4 * 112)
     for name in ("history.json", "history.csv", "last.safetensors"):

@@ -315,7 +315,10 @@ class Run:
             "rotations": self.options.rotations,
             "recipe": _portable(self.options.as_dict()),
             "epoch": self.epoch,
-            "data": {scene.name: len(scene) for scene in self.real_scenes},
+            "data": {
+                "photos": sum(len(scene) for scene in self.real_scenes),
+                "scenes": [scene.name for scene in self.real_scenes],
+            },
             "validation": self.validation_scenes,
             "scores": scores,
             **self.metadata,
@@ -454,6 +457,12 @@ class Run:
         record = [(s.name, s.names, int(s.common_points.sum())) for s in self.scenes]
         text = repr((record, self.validation_scenes))
         return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _portable(recipe: dict[str, Any]) -> dict[str, Any]:
+    """Return settings whose files are named without their folders, fit to be published."""
+    files = ("weights", "start", "teacher")
+    return recipe | {key: Path(recipe[key]).name for key in files if recipe[key]}
 
 
 def _pseudo_scenes(scenes: Sequence[Scene], options: TrainOptions) -> list[Scene]:
