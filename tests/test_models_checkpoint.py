@@ -295,7 +295,7 @@ def test_shipped_models_run_and_carry_their_licence(name):
     assert card["name"] == name
     assert card["licence"]
     assert not {"sheffield_cross", "sarawak_palm", "corpus_christi"} & set(card["data"]["scenes"])
-    assert "/" not in card["command"].replace("scripts/", "")
+    assert " /" not in card["command"]
     photo = np.random.default_rng(0).integers(0, 256, (1, 3, 48, 64), np.uint8)
     descriptor = load_model(name, "cpu").describe(photo)
     assert descriptor.shape == (1, card["dim"])
