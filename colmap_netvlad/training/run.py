@@ -494,9 +494,3 @@ def _batch(plain: list[Any]) -> Batch:
         tuple((scene, image) for scene, image in samples),
         tuple(Query(a, tuple(positives), tuple(negatives)) for a, positives, negatives in queries),
     )
-
-
-def _portable(recipe: dict[str, Any]) -> dict[str, Any]:
-    """Return a recipe with the names of its files, not where they lay on this machine."""
-    files = ("weights", "start", "teacher")
-    return recipe | {name: Path(recipe[name]).name for name in files if recipe.get(name)}
