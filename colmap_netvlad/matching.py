@@ -1,7 +1,12 @@
 """Pairs -> matches and two-view geometries in the database, through pycolmap.
 
 Pairs are matched in chunks of a few seconds, each written when done: a stopped run loses one
-chunk at most, and the next run goes on with the rest, since COLMAP never matches a pair twice.
+chunk a process at most, and the next run goes on with the rest.
+
+COLMAP's CPU matcher searches with faiss, whose k-means in several threads of one process at
+times gives an image a wrong index (pycolmap 4.2.1: about one image in 1,500 lost up to all its
+matches). So each process here matches with one thread, in a database of its own that holds the
+features of its chunk, and there are as many processes as processors.
 """
 
 from __future__ import annotations
@@ -16,16 +21,25 @@ from pathlib import Path
 
 import pycolmap
 
-from colmap_netvlad import engine, progress
+from colmap_netvlad import engine, progress, workers
 from colmap_netvlad.database import open_database, pair_id
 from colmap_netvlad.errors import InputError
-from colmap_netvlad.pairs import in_colmap_list
 
 FIRST_CHUNK = 32
 """Pairs of the first chunk; the next ones are sized to take `CHUNK_SECONDS`."""
 
 CHUNK_SECONDS = 5.0
 MAX_CHUNK = 4096
+
+BLOCK = 64
+"""Processes take turns by blocks of this many pairs: neighbours in the list share images, and
+all processes get their share of the pairs that are slow."""
+
+WORTH_A_PROCESS = 128
+"""Fewer pairs than this take less time than a process takes to start."""
+
+LOCK_SECONDS = 60.0
+"""How long a process waits for the others' writing, a fraction of a second each."""
 
 
 @dataclass(frozen=True)
@@ -34,11 +48,11 @@ class MatchOptions:
 
     Attributes:
         seed: seed of the robust estimation, so that a pair always gives the same inliers.
-        threads: threads; None: all processors.
+        processes: how many work at once; None: all processors.
     """
 
     seed: int = 0
-    threads: int | None = None
+    processes: int | None = None
 
 
 @dataclass(frozen=True)
@@ -67,13 +81,12 @@ def match_pairs(
 ) -> MatchReport:
     """Match image pairs and verify them geometrically, writing into `database`.
 
-    pycolmap brings a database of COLMAP 3.x to the schema of COLMAP 4. COLMAP's pairs list splits
-    a line on spaces, so pairs of names with spaces are matched in a temporary database under
-    other names and their results copied, in one transaction a chunk.
+    pycolmap brings a database of COLMAP 3.x to the schema of COLMAP 4. A script that calls this
+    needs Python's `if __name__ == "__main__":`, as the processes import it again.
 
     Raises:
         InputError: an unknown image name, no features at all, or a database that cannot be
-            written.
+            written; a process that failed: what was matched by then stays.
     """
     engine.check_writable(database)
     with open_database(database) as colmap:
@@ -90,15 +103,11 @@ def match_pairs(
     # In the order of ids, neighbours in the list share an image that COLMAP then has in memory.
     requested = sorted({_sorted_ids(ids[a], ids[b]) for a, b in pairs if a != b})
     todo = [pair for pair in requested if pair not in done]
-    names = {image_id: name for name, image_id in ids.items()}
     start = time.monotonic()
-    with progress.step("Matching pairs", len(todo)) as bar:
-        listed = [pair for pair in todo if all(in_colmap_list(names[i]) for i in pair)]
-        aliased = [pair for pair in todo if not all(in_colmap_list(names[i]) for i in pair)]
-        _in_chunks(listed, bar, lambda chunk: _match(database, chunk, names, options))
-        if aliased:
-            pycolmap.Database.open(database).close()  # brings an old schema up to date
-        _in_chunks(aliased, bar, lambda chunk: _match_under_aliases(database, chunk, options))
+    if todo:
+        pycolmap.Database.open(database).close()  # brings an old schema up to date
+        with progress.step("Matching pairs", len(todo)) as bar:
+            _match_all(database, todo, options, bar.advance)
     seconds = time.monotonic() - start
     with open_database(database) as colmap:
         verified = colmap.verified_matches()
@@ -118,58 +127,98 @@ def _sorted_ids(id1: int, id2: int) -> IdPair:
     return (id1, id2) if id1 < id2 else (id2, id1)
 
 
-def _in_chunks(
-    pairs: Sequence[IdPair], bar: progress.Step, match: Callable[[Sequence[IdPair]], None]
+def _match_all(
+    database: Path, pairs: Sequence[IdPair], options: MatchOptions, advance: Callable[[int], None]
 ) -> None:
-    """Match all pairs in chunks that take about `CHUNK_SECONDS`."""
+    most = 1 if pycolmap.has_cuda else options.processes or engine.usable_processors()
+    count = max(1, min(most, len(pairs) // WORTH_A_PROCESS))
+    with tempfile.TemporaryDirectory(prefix="colmap-netvlad-") as folder:
+        if count == 1:
+            _match_in_chunks(advance, database, Path(folder), pairs, options.seed)
+        else:
+            _match_in_processes(count, advance, database, Path(folder), pairs, options.seed)
+
+
+def _match_in_processes(
+    count: int,
+    advance: Callable[[int], None],
+    database: Path,
+    folder: Path,
+    pairs: Sequence[IdPair],
+    seed: int,
+) -> None:
+    blocks = [pairs[at : at + BLOCK] for at in range(0, len(pairs), BLOCK)]
+    jobs = []
+    for number in range(count):
+        own = folder / f"{number}"
+        own.mkdir()
+        share = [pair for block in blocks[number::count] for pair in block]
+        jobs.append(workers.Job(_match_in_chunks, (database, own, share, seed)))
+    for outcome in workers.run(jobs, count, advance):
+        if outcome.fault:
+            raise InputError(
+                f"Matching stopped: {outcome.fault.rstrip('.')}. What is matched stays in "
+                f"{database}; run the command again to go on."
+            )
+
+
+def _match_in_chunks(
+    advance: Callable[[int], None],
+    database: Path,
+    folder: Path,
+    pairs: Sequence[IdPair],
+    seed: int,
+) -> None:
+    """Match all pairs in chunks that take about `CHUNK_SECONDS`, each kept when done."""
     size, at = FIRST_CHUNK, 0
     while at < len(pairs):
         chunk = pairs[at : at + size]
         start = time.monotonic()
-        match(chunk)
-        bar.advance(len(chunk))
+        _match_apart(database, folder, chunk, seed)
+        advance(len(chunk))
         at += len(chunk)
         rate = len(chunk) / max(time.monotonic() - start, 1e-3)
         size = int(min(max(rate * CHUNK_SECONDS, 1), 4 * size, MAX_CHUNK))
 
 
-def _match(
-    database: Path, pairs: Sequence[IdPair], names: dict[int, str], options: MatchOptions
-) -> None:
-    matching = pycolmap.FeatureMatchingOptions()
-    if options.threads is not None:
-        matching.num_threads = options.threads
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = options.seed
-    with tempfile.TemporaryDirectory(prefix="colmap-netvlad-") as folder:
-        pairing = pycolmap.ImportedPairingOptions()
-        pairing.match_list_path = Path(folder, "pairs.txt")
-        lines = (f"{names[a]} {names[b]}\n" for a, b in pairs)
-        pairing.match_list_path.write_text("".join(lines), encoding="utf-8")
-        engine.call(
-            pycolmap.match_image_pairs,
-            database.parent,
-            database,
-            matching_options=matching,
-            pairing_options=pairing,
-            verification_options=verification,
-        )
+def _match_apart(database: Path, folder: Path, pairs: Sequence[IdPair], seed: int) -> None:
+    """Match pairs in a database of their features alone and copy the results to `database`.
 
-
-def _match_under_aliases(database: Path, pairs: Sequence[IdPair], options: MatchOptions) -> None:
-    """Match pairs whose names COLMAP's list cannot hold, in a database of their features alone."""
-    images = sorted({image_id for pair in pairs for image_id in pair})
-    aliases = {image_id: f"image{image_id}" for image_id in images}
-    with tempfile.TemporaryDirectory(prefix="colmap-netvlad-") as folder:
-        scratch = Path(folder, "aliases.db")
-        pycolmap.Database.open(scratch).close()
+    Images have aliases there: COLMAP's pairs list splits a line on the spaces of names.
+    """
+    aliases = {image_id: f"image{image_id}" for pair in pairs for image_id in pair}
+    scratch, listed = folder / "matches.db", folder / "pairs.txt"
+    pycolmap.Database.open(scratch).close()
+    try:
         _copy_features(database, scratch, aliases)
-        _match(scratch, pairs, aliases, options)
+        listed.write_text("".join(f"{aliases[a]} {aliases[b]}\n" for a, b in pairs))
+        _match(scratch, listed, database.parent, seed)
         _copy_matches(scratch, database, [pair_id(*pair) for pair in pairs])
+    finally:
+        for used in folder.glob("matches.db*"):
+            used.unlink()
+
+
+def _match(scratch: Path, listed: Path, watched: Path, seed: int) -> None:
+    matching = pycolmap.FeatureMatchingOptions()
+    if not pycolmap.has_cuda:
+        matching.num_threads = 1
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = seed
+    pairing = pycolmap.ImportedPairingOptions()
+    pairing.match_list_path = listed
+    engine.call(
+        pycolmap.match_image_pairs,
+        watched,
+        scratch,
+        matching_options=matching,
+        pairing_options=pairing,
+        verification_options=verification,
+    )
 
 
 def _copy_features(source: Path, target: Path, aliases: dict[int, str]) -> None:
-    with closing(sqlite3.connect(target)) as connection:
+    with closing(sqlite3.connect(target, timeout=LOCK_SECONDS)) as connection:
         connection.execute("ATTACH ? AS source", (f"{source.resolve()}",))
         connection.execute("CREATE TEMP TABLE wanted (image_id INTEGER PRIMARY KEY, alias TEXT)")
         connection.executemany("INSERT INTO wanted VALUES (?, ?)", aliases.items())
@@ -185,7 +234,7 @@ def _copy_features(source: Path, target: Path, aliases: dict[int, str]) -> None:
 
 def _copy_matches(source: Path, target: Path, pairs: Sequence[int]) -> None:
     """Copy the results of some pairs whole or not at all."""
-    with closing(sqlite3.connect(target, timeout=engine.LOCK_SECONDS)) as connection:
+    with closing(sqlite3.connect(target, timeout=LOCK_SECONDS)) as connection:
         connection.execute("ATTACH ? AS source", (f"{source.resolve()}",))
         connection.execute("CREATE TEMP TABLE wanted (pair_id INTEGER PRIMARY KEY)")
         connection.executemany("INSERT INTO wanted VALUES (?)", [(pair,) for pair in pairs])

@@ -108,7 +108,7 @@ def read_pairs(path: Path, names: Collection[str]) -> list[tuple[str, str]]:
     return list(unique.values())
 
 
-def in_colmap_list(name: str) -> bool:
+def _in_colmap_list(name: str) -> bool:
     """Whether COLMAP's pairs list can express an image name."""
     return not (name.startswith("#") or any(c.isspace() for c in name))
 
@@ -116,7 +116,7 @@ def in_colmap_list(name: str) -> bool:
 def _colmap_text(pairs: Iterable[ImagePair]) -> tuple[str, list[str]]:
     lines, unwritable = [], set()
     for pair in pairs:
-        bad = [name for name in (pair.name1, pair.name2) if not in_colmap_list(name)]
+        bad = [name for name in (pair.name1, pair.name2) if not _in_colmap_list(name)]
         unwritable.update(bad)
         if not bad:
             lines.append(f"{pair.name1} {pair.name2}\n")

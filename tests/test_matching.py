@@ -7,13 +7,14 @@ import sqlite3
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from colmap_netvlad import engine, matching
+from colmap_netvlad import engine, matching, workers
 from colmap_netvlad.database import image_names, open_database, pair_id
 from colmap_netvlad.errors import InputError
-from colmap_netvlad.matching import match_pairs
+from colmap_netvlad.matching import MatchOptions, match_pairs
 from colmap_netvlad.project import Project
 
 MakeProject = Callable[..., Project]
@@ -90,6 +91,38 @@ def test_matches_are_the_same_twice_and_in_chunks_of_any_size(
     monkeypatch.setattr(matching, "CHUNK_SECONDS", 0.0)
     match_pairs(two, some_pairs(two)[::-1])
     assert results(one) == results(two)
+
+
+def test_several_processes_give_the_same_matches_as_one(
+    project_copy: MakeProject, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one, two = (project_copy(name=name).database for name in ("one", "two"))
+    match_pairs(one, some_pairs(one, 6), MatchOptions(processes=1))
+    monkeypatch.setattr(matching, "WORTH_A_PROCESS", 5)
+    monkeypatch.setattr(matching, "BLOCK", 2)
+    report = match_pairs(two, some_pairs(two, 6), MatchOptions(processes=3))
+    assert report.matched == 15
+    assert results(one) == results(two) and len(results(two)) == 15
+
+
+def test_a_failing_process_is_said_and_leaves_what_is_matched(
+    project_copy: MakeProject, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    database = project_copy().database
+    monkeypatch.setattr(matching, "WORTH_A_PROCESS", 5)
+    monkeypatch.setattr(matching, "BLOCK", 5)
+    run = workers.run
+
+    def without_the_second_folder(jobs: list[workers.Job], *others: Any) -> Any:
+        jobs[1].arguments[1].rmdir()
+        return run(jobs, *others)
+
+    monkeypatch.setattr(workers, "run", without_the_second_folder)
+    with pytest.raises(InputError, match="run the command again"):
+        match_pairs(database, some_pairs(database, 5), MatchOptions(processes=2))
+    assert len(results(database)) == 5
+    monkeypatch.undo()
+    assert match_pairs(database, some_pairs(database, 5)).matched == 5
 
 
 def test_a_stopped_run_goes_on_with_the_pairs_left(

@@ -8,10 +8,9 @@ from pathlib import Path
 
 import pycolmap
 
-from colmap_netvlad import progress
+from colmap_netvlad import progress, workers
 from colmap_netvlad.database import open_database
 from colmap_netvlad.errors import InputError
-from colmap_netvlad.mapping import workers
 from colmap_netvlad.mapping.incremental import map_incremental, pipeline_options
 from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.mapping.output import model_folder

@@ -136,6 +136,7 @@ def _build(tree: Path, sample: NDArray[np.float32], words: int, seed: int) -> No
     options.num_visual_words = words
     options.num_iterations = BUILD_ITERATIONS
     options.num_rounds = 1
+    options.num_threads = 1  # with several, faiss's k-means now and then gives another tree
     with progress.step(f"Building a vocabulary tree of {words} words", 1) as bar:
         index.build(
             options,
