@@ -340,11 +340,12 @@ def match(
     This writes matches into the database, where COLMAP keeps them (--copy does not); one of
     COLMAP 3.x is brought to the schema of COLMAP 4. A stopped run goes on where it stopped.
     """
+    from colmap_netvlad.connect import verified_components
     from colmap_netvlad.database import image_names
     from colmap_netvlad.matching import MatchOptions, match_pairs
     from colmap_netvlad.pairs import read_pairs
     from colmap_netvlad.project import find_project
-    from colmap_netvlad.reconstruct import working_copy
+    from colmap_netvlad.reconstruct import view_graph_lines, working_copy
 
     project = find_project(database, images)
     listed = pairs or project.pairs
@@ -359,6 +360,8 @@ def match(
         f"Pairs: {report.requested:,} ({report.already:,} matched before), {report.verified:,} "
         f"verified, {report.seconds / 60:.1f} minutes. Matches are in {project.database}."
     )
+    for line in view_graph_lines(verified_components(project.database)):
+        click.echo(line)
 
 
 def match_and_print_rounds(
@@ -495,6 +498,13 @@ def quoted(path: Path) -> str:
     help="Folder of masks in COLMAP's way (<photo>.png): black areas are neutral to networks.",
 )
 @click.option("--join", "own_pairs", type=FILE, help="A pairs list of your own to join in.")
+@click.option(
+    "--connect/--no-connect",
+    default=True,
+    show_default=True,
+    help="Where each image's k nearest leave the images in several components, add the best few"
+    " pairs between these (5 % at most).",
+)
 @cache_option
 @device_option
 @seed_option
@@ -514,6 +524,7 @@ def pairs(
     sequential: int,
     own_pairs: Path | None,
     masks: Path | None,
+    connect: bool,
     cache: Path | None,
     device: str | None,
     seed: int,
@@ -541,7 +552,7 @@ def pairs(
         gps=gps,
     )
     rules = PartnerRules(other_cameras, sequential, own_pairs)
-    report = make_pairs(project, method or DEFAULT, options, format, output, rules)
+    report = make_pairs(project, method or DEFAULT, options, format, output, rules, connect)
     for line in summary(project, report):
         click.echo(line)
     finish_partial([f"Left out: {name} {reason}" for name, reason in report.ranking.left_out])

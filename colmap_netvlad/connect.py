@@ -1,23 +1,74 @@
 """Connected, or said so: pairs that could join the components of a graph.
 
-Several disconnected models are what users hate most. Where the verified view graph falls apart,
-the best untested candidates across its components get a small extra budget.
+Several disconnected models are what users hate most. Where the pairs, or later the verified view
+graph, fall apart, the best untested candidates across components get a small extra budget, and
+what stays apart is listed.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
+from colmap_netvlad.database import image_names
+from colmap_netvlad.metrics import Pair, correct_pairs, verified_by_name
+
 IndexPair = tuple[int, int]
 
 TRIES_PER_LINK = 5
 """Candidates tried between the same two components in one go."""
+
+CONNECTING_SHARE = 0.05
+"""Extra budget for pairs between components, as a share of the budget."""
+
+MOST_LISTED = 10
+"""Components apart that are listed, and images of each by name."""
+
+
+def connecting_budget(pairs: int) -> int:
+    """Return how many pairs between components may come on top of `pairs`: at least one link's."""
+    return max(TRIES_PER_LINK, round(CONNECTING_SHARE * pairs))
+
+
+def component_names(names: Sequence[str], pairs: Iterable[Pair]) -> list[list[str]]:
+    """Return the image names of each connected component, the largest first."""
+    index = {name: i for i, name in enumerate(names)}
+    labels = components(len(names), ((index[a], index[b]) for a, b in pairs))
+    groups: list[list[str]] = [[] for _ in range(int(labels.max(initial=-1)) + 1)]
+    for name, label in zip(names, labels.tolist(), strict=True):
+        groups[label].append(name)
+    return groups
+
+
+def verified_components(database: Path) -> list[list[str]]:
+    """Return the components of a database's verified view graph, the largest first.
+
+    Raises:
+        InputError: the database cannot be read.
+    """
+    return component_names(image_names(database), correct_pairs(verified_by_name(database)))
+
+
+def apart_lines(groups: Sequence[Sequence[str]]) -> list[str]:
+    """Return lines with the images of each component but the largest.
+
+    Args:
+        groups: image names of each component, the largest first.
+    """
+    several = [group for group in groups[1:] if len(group) > 1]
+    single = [group[0] for group in groups[1:] if len(group) == 1]
+    lines = [f"{len(group)} images: {_first(group)}" for group in several[:MOST_LISTED]]
+    if len(several) > MOST_LISTED:
+        lines.append(f"and {len(several) - MOST_LISTED} smaller components")
+    if single:
+        lines.append(f"{len(single)} alone: {_first(single)}")
+    return lines
 
 
 def components(num_images: int, pairs: Iterable[IndexPair]) -> NDArray[np.int64]:
@@ -78,3 +129,8 @@ def connecting_pairs(
             tries[link] += 1
             chosen.append((i, j))
     return chosen
+
+
+def _first(names: Sequence[str]) -> str:
+    more = f", and {len(names) - MOST_LISTED} more" if len(names) > MOST_LISTED else ""
+    return f"{', '.join(names[:MOST_LISTED])}{more}"

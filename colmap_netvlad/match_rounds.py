@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from scipy import sparse
 
-from colmap_netvlad.connect import TRIES_PER_LINK, components, connecting_pairs
+from colmap_netvlad.connect import components, connecting_budget, connecting_pairs
 from colmap_netvlad.database import image_names, open_database
 from colmap_netvlad.errors import InputError
 from colmap_netvlad.matching import MatchOptions, MatchReport, match_pairs
@@ -25,12 +25,6 @@ from colmap_netvlad.retrieval.methods import RetrievalOptions, rank
 from colmap_netvlad.retrieval.ranking import Ranking
 from colmap_netvlad.retrieval.store import Store
 from colmap_netvlad.rounds import IndexPair, next_round, split_budget
-
-CONNECTING_SHARE = 0.05
-"""Extra budget for pairs between components, as a share of the budget (at least one link's)."""
-
-MOST_LISTED = 10
-"""Images listed by name for each component apart."""
 
 PLAN_SETTING = "rounds"
 """Where the cache keeps the rounds chosen so far."""
@@ -62,13 +56,11 @@ class RoundsReport:
         matches: all rounds together.
         rounds: round by round.
         budget: pairs that could have been spent, without the connecting ones.
-        components: image names of each component of the verified view graph, largest first.
     """
 
     matches: MatchReport
     rounds: list[RoundReport] = field(default_factory=list)
     budget: int = 0
-    components: list[list[str]] = field(default_factory=list)
 
 
 def match_in_rounds(
@@ -81,7 +73,7 @@ def match_in_rounds(
     """Match at most `budget` pairs of a ranking's candidates in rounds, into the database.
 
     Pairs that were matched before this plan count as evidence, not against the budget. Where the
-    verified view graph falls apart, up to `CONNECTING_SHARE` more are tried between components.
+    verified view graph falls apart, up to `connecting_budget` more are tried between components.
     The plan is kept in the cache, so a killed run goes on with the same pairs.
 
     Args:
@@ -124,7 +116,7 @@ def rank_and_match_in_rounds(
 
 
 def rounds_lines(report: RoundsReport) -> list[str]:
-    """Return a line for each round, and what fell apart."""
+    """Return a line for each round."""
     lines = [
         f"{r.title.capitalize()}: {r.pairs:,} pairs, {r.correct:,} with more than "
         f"{CORRECT_MATCHES} verified matches"
@@ -134,10 +126,6 @@ def rounds_lines(report: RoundsReport) -> list[str]:
     spent = report.matches.requested
     if spent < report.budget:
         lines.append(f"Stopped at {spent:,} of {report.budget:,} pairs: nothing promising is left.")
-    for group in report.components[1:]:
-        shown = ", ".join(group[:MOST_LISTED])
-        more = f", and {len(group) - MOST_LISTED} more" if len(group) > MOST_LISTED else ""
-        lines.append(f"Apart from the largest component: {len(group)}: {shown}{more}")
     return lines
 
 
@@ -244,7 +232,7 @@ class _Run:
                 components(len(self.ids), _correct(verified)),
                 verified,
                 self.ranking.names,
-                max(TRIES_PER_LINK, round(CONNECTING_SHARE * self.budget)),
+                connecting_budget(self.budget),
             )
             self.plan.save()
         seconds = time.perf_counter() - start
@@ -279,11 +267,7 @@ class _Run:
             verified=sum(verified.get(pair, 0) > 0 for pair in chosen),
             seconds=sum(r.seconds_choosing + r.seconds_matching for r in reports),
         )
-        labels = components(len(self.ids), _correct(verified))
-        groups: list[list[str]] = [[] for _ in range(int(labels.max(initial=-1)) + 1)]
-        for name, label in zip(self.ranking.names, labels.tolist(), strict=True):
-            groups[label].append(name)
-        return RoundsReport(matches, reports, self.budget, groups)
+        return RoundsReport(matches, reports, self.budget)
 
 
 def _correct(verified: dict[IndexPair, int]) -> list[IndexPair]:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from rich.table import Table
 
+from colmap_netvlad.connect import apart_lines, verified_components
 from colmap_netvlad.database import copy_database, open_database
 from colmap_netvlad.errors import InputError
 from colmap_netvlad.mapping import MAPPERS
@@ -50,6 +51,7 @@ class ReconstructReport:
         total: figures of all models together.
         missing: names of the images without a pose in any model.
         seconds: duration by stage, s.
+        components: image names of each component of the verified view graph, largest first.
     """
 
     output: Path
@@ -59,6 +61,7 @@ class ReconstructReport:
     total: ModelSummary
     missing: list[str] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
+    components: list[list[str]] = field(default_factory=list)
 
 
 def reconstruct(
@@ -129,6 +132,7 @@ def map_and_report(
         total=combine(models),
         missing=[name for name in names if name not in registered],
         seconds=seconds,
+        components=verified_components(project.database),
     )
 
 
@@ -183,12 +187,24 @@ def report_lines(report: ReconstructReport) -> list[str]:
         + ", ".join(f"{stage} {time / 60:.1f}" for stage, time in report.seconds.items())
         + f", together {sum(report.seconds.values()) / 60:.1f}.",
     ]
+    lines += view_graph_lines(report.components)
     if report.missing:
         lines.append(
             f"Not registered: {len(report.missing)} of {report.images} images: "
             f"{_first(report.missing)}."
         )
     return lines
+
+
+def view_graph_lines(groups: Sequence[Sequence[str]]) -> list[str]:
+    """Return which images no verified pair joins to the rest, or nothing."""
+    if len(groups) < 2:
+        return []
+    return [
+        f"View graph: {len(groups)} components; apart from the largest of {len(groups[0]):,} "
+        "images are (a larger --k, or --rounds, may join them):",
+        *(f"  {line}" for line in apart_lines(groups)),
+    ]
 
 
 def _cells(model: ModelSummary, images: int) -> tuple[str, ...]:

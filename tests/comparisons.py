@@ -9,12 +9,12 @@ import numpy as np
 
 from colmap_netvlad import metrics
 from colmap_netvlad.compare.evidence import Evidence, Plan
+from colmap_netvlad.compare.figures import retrieval_figures
 from colmap_netvlad.compare.finds import single_finds
 from colmap_netvlad.compare.result import (
     Comparison,
     MethodResult,
     ModelFigures,
-    RetrievalFigures,
 )
 from colmap_netvlad.metrics import as_pair
 
@@ -76,7 +76,7 @@ def made_up(
             seconds_match=0.05 * len(pairs_at[method][ks[-1]]),
             mean_average_precision=0.9 - 0.1 * lost,
             only_here=len(found[method]),
-            at_k=tuple(_figures(k, pairs_at[method][k], evidence) for k in ks),
+            at_k=tuple(retrieval_figures(pairs_at[method][k], k, evidence) for k in ks),
             model=ModelFigures(ks[-1], 1, images - lost, 4000, 12000, 0.7, 3.0, 40.0),
         )
         for lost, method in enumerate(NOISE)
@@ -99,9 +99,3 @@ def _nearest(seen: np.ndarray, k: int) -> np.ndarray:
 
     found = cKDTree(seen).query(seen, k=k + 1)[1]
     return np.array([[j for j in row if j != i][:k] for i, row in enumerate(found)], np.int32)
-
-
-def _figures(k: int, pairs: set[tuple[str, str]], evidence: Evidence) -> RetrievalFigures:
-    correct = pairs & evidence.truth
-    accuracy, recall = len(correct) / len(pairs), len(correct) / len(evidence.truth)
-    return RetrievalFigures(k, len(pairs), len(correct), accuracy, recall, 1, len(evidence.names))

@@ -357,7 +357,7 @@ def test_comparisons_of_another_version_are_refused(whole, tmp_path):
     path = tmp_path / "compare.json"
     write_json(path, whole[0])
     assert read_json(path) == whole[0]
-    path.write_text(path.read_text().replace('"format": 1', '"format": 99'))
+    path.write_text(path.read_text().replace('"format": 2', '"format": 99'))
     with pytest.raises(InputError, match="format 99"):
         read_json(path)
     path.write_text("[]")

@@ -5,7 +5,13 @@ from __future__ import annotations
 import numpy as np
 from scipy import sparse
 
-from colmap_netvlad.connect import TRIES_PER_LINK, components, connecting_pairs
+from colmap_netvlad.connect import (
+    TRIES_PER_LINK,
+    apart_lines,
+    component_names,
+    components,
+    connecting_pairs,
+)
 
 
 def test_components_are_numbered_by_size() -> None:
@@ -39,3 +45,15 @@ def test_one_hopeless_link_does_not_starve_another() -> None:
     )
     assert len(chosen) == TRIES_PER_LINK + 1
     assert (0, 20) in chosen
+
+
+def test_what_stays_apart_is_listed_briefly() -> None:
+    names = [f"{i:02d}" for i in range(40)]
+    pairs = [(names[i], names[i + 1]) for i in range(11)] + [("12", "13"), ("13", "14")]
+    groups = component_names(names, pairs)
+    assert [len(group) for group in groups[:3]] == [12, 3, 1]
+    assert apart_lines(groups) == [
+        "3 images: 12, 13, 14",
+        "25 alone: 15, 16, 17, 18, 19, 20, 21, 22, 23, 24, and 15 more",
+    ]
+    assert apart_lines(component_names(names[:12], pairs[:11])) == []

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from colmap_netvlad import match_rounds
+from colmap_netvlad.connect import verified_components
 from colmap_netvlad.database import image_names, open_database
 from colmap_netvlad.errors import InputError
 from colmap_netvlad.match_rounds import match_in_rounds, plan_budget
@@ -39,7 +40,7 @@ def test_the_budget_is_kept_and_the_pairs_are_in_the_database(
     assert sum(r.pairs for r in report.rounds if r.title != "connecting") <= 18
     assert report.matches.requested == len(matched(project))
     assert [r.title for r in report.rounds][:2] == ["round 1 of 3", "round 2 of 3"]
-    assert len(report.components[0]) == 12
+    assert len(verified_components(project.database)[0]) == 12
 
 
 def test_a_killed_run_goes_on_with_the_same_pairs(
@@ -98,7 +99,7 @@ def test_where_everything_fails_the_rounds_stop_early(
     report = match_in_rounds(project, ranking, budget=60, rounds=6)
     assert sum(r.correct for r in report.rounds) == 0
     assert sum(r.pairs for r in report.rounds) < 60
-    assert len(report.components) == 12
+    assert len(verified_components(project.database)) == 12
 
 
 def test_a_ranking_of_other_images_is_one_sentence(

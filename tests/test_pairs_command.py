@@ -27,7 +27,9 @@ from colmap_netvlad.database import image_names
 from colmap_netvlad.errors import EXIT_PARTIAL
 from colmap_netvlad.pairs import union_of_top
 from colmap_netvlad.project import Project, find_project
+from colmap_netvlad.retrieval.methods import RetrievalOptions
 from colmap_netvlad.retrieval.ranking import NO_PARTNER, Ranking
+from colmap_netvlad.retrieval.run import make_pairs
 from colmap_netvlad.retrieval.store import Store
 
 MakeProject = Callable[..., Project]
@@ -219,22 +221,47 @@ def test_json_holds_scores_and_ranks(project_copy: MakeProject, tmp_path: Path) 
     assert len(union_of_top(kept, 3)) == len(rows)
 
 
-def test_components_apart_are_listed_with_their_images(tmp_path: Path) -> None:
+@pytest.fixture
+def two_places(tmp_path: Path) -> Path:
+    """A database of two groups of three images, a hundred metres apart."""
     database = tmp_path / "project.db"
     names = [f"{i}.png" for i in range(6)]
     make_database(database, "3.9")
     add_images(database, names)
     with closing(sqlite3.connect(database)) as connection:
-        for i in range(6):  # two groups of three, a hundred metres apart
+        for i in range(6):
             connection.execute(
                 "UPDATE images SET prior_tx = ?, prior_ty = 0, prior_tz = 0 WHERE image_id = ?",
                 (i + 100 * (i // 3), i + 1),
             )
         connection.commit()
-    result = run("--db", database, "--k", 2, "--method", "spatial")
+    return database
+
+
+def test_components_apart_are_listed_with_their_images(two_places: Path) -> None:
+    result = run("--db", two_places, "--k", 2, "--method", "spatial", "--no-connect")
     assert result.exit_code == 0, result.output
     assert "Components   2" in result.output
-    assert "3: 3.png, 4.png, 5.png" in result.output
+    assert "3 images: 3.png, 4.png, 5.png" in result.output
+    assert len((two_places.parent / "pairs.txt").read_text().splitlines()) == 6
+
+
+def test_components_of_the_k_nearest_are_joined_by_the_best_pairs_between(
+    two_places: Path,
+) -> None:
+    result = run("--db", two_places, "--k", 2, "--method", "spatial")
+    assert result.exit_code == 0, result.output
+    assert "5 pairs added between components" in result.output
+    assert "Components   1" in result.output
+    lines = (two_places.parent / "pairs.txt").read_text().splitlines()
+    assert len(lines) == 11 and "2.png 3.png" in lines  # the nearest two of the two groups
+
+
+def test_images_that_are_connected_get_no_further_pairs(project_copy: MakeProject) -> None:
+    project = project_copy()
+    with_option = make_pairs(project, "vlad", RetrievalOptions(k=4))
+    without = make_pairs(project, "vlad", RetrievalOptions(k=4), connect=False)
+    assert with_option.pairs == without.pairs and not with_option.connecting
 
 
 @pytest.mark.parametrize(

@@ -179,7 +179,9 @@ def test_images_left_out_are_counted_and_named(project_copy: MakeProject) -> Non
     report = reconstruct(project)
     assert set(report.missing) >= set(names[8:])
     assert report.images == 12 and report.total.registered == 12 - len(report.missing)
-    assert f"Not registered: {len(report.missing)} of 12 images: " in report_lines(report)[-1]
+    lines = report_lines(report)
+    assert f"Not registered: {len(report.missing)} of 12 images: " in lines[-1]
+    assert f"  4 alone: {', '.join(names[8:])}" in lines
 
 
 def test_summaries_count_an_image_of_two_models_once(project_copy: MakeProject) -> None:

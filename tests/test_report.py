@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from colmap_netvlad.compare.evidence import Plan
+from colmap_netvlad.compare.figures import retrieval_figures
 from colmap_netvlad.compare.finds import single_finds
 from colmap_netvlad.compare.result import MethodResult, ModelFigures, RetrievalFigures
 from colmap_netvlad.metrics import as_pair
@@ -129,11 +130,31 @@ def test_page_with_one_k_and_one_failed_method(small):
     assert "no weights &lt;here&gt;" in text and "Not everything finished" in text
 
 
+def test_page_says_where_a_view_graph_splits():
+    comparison, evidence = made_up(30, (5,))
+    assert "Nowhere: no single image" in render_page(comparison, evidence)
+    chain = {as_pair(a, b) for a, b in itertools.pairwise(evidence.names)}
+    evidence = replace(
+        evidence,
+        pairs={**evidence.pairs, "vlad": chain},
+        verified=dict.fromkeys(chain | evidence.truth, 100),
+        truth=chain | evidence.truth,
+    )
+    figures = retrieval_figures(chain, 5, evidence)
+    assert (figures.bridges, figures.articulation_images, figures.components) == (29, 28, 1)
+    methods = tuple(
+        replace(m, at_k=(figures,)) if m.name == "vlad" else m for m in comparison.methods
+    )
+    text = render_page(replace(comparison, methods=methods), evidence)
+    assert "28 images: " in text and "29 connections: " in text
+    assert "DJI_0000.JPG – DJI_0001.JPG" in text
+
+
 # Best of a row
 
 
 def method(name: str, correct: int | None, error: float | None = None) -> MethodResult:
-    at_k = () if correct is None else (RetrievalFigures(5, 100, correct, None, None, 1, 9),)
+    at_k = () if correct is None else (RetrievalFigures(5, 100, correct, None, None, 1, 9, 0, 0),)
     model = ModelFigures(5, 1, 9, 10, 20, error, 2.0, 1.0)
     return MethodResult(name, "", at_k=at_k, model=model)
 

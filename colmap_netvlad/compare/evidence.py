@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
 
@@ -53,3 +54,10 @@ class Evidence:
     truth: set[Pair]
     positions: NDArray[np.float64]
     plans: Mapping[str, Plan] = field(default_factory=dict)
+
+    def view_graph(self, pairs: Iterable[Pair]) -> nx.Graph:
+        """Return all images, joined by those of the pairs that are correct."""
+        graph = nx.Graph()
+        graph.add_nodes_from(self.names)
+        graph.add_edges_from(sorted(self.truth.intersection(pairs)))
+        return graph

@@ -7,9 +7,8 @@ import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
+import networkx as nx
 import pycolmap
-from scipy import sparse
 
 from colmap_netvlad import __version__, engine, metrics
 from colmap_netvlad.compare import pool
@@ -126,7 +125,7 @@ def compute_figures(
                 match_measured=share,
                 mean_average_precision=_number(precision) if candidate.ranks else None,
                 only_here=found.get(candidate.name, 0),
-                at_k=tuple(_at_k(pairs[k][candidate.name], k, evidence) for k in ks),
+                at_k=tuple(retrieval_figures(pairs[k][candidate.name], k, evidence) for k in ks),
                 model=candidate.model,
             )
         methods.append(result)
@@ -148,27 +147,21 @@ def compute_figures(
     )
 
 
-def _at_k(pairs: set[Pair], k: int, evidence: Evidence) -> RetrievalFigures:
-    correct = pairs & evidence.truth
-    sizes = _component_sizes(evidence.names, correct)
+def retrieval_figures(pairs: set[Pair], k: int, evidence: Evidence) -> RetrievalFigures:
+    """Return what a method's pairs at `k` are worth."""
+    graph = evidence.view_graph(pairs)
+    sizes = [len(component) for component in nx.connected_components(graph)]
     return RetrievalFigures(
         k=k,
         pairs=len(pairs),
-        correct=len(correct),
+        correct=graph.number_of_edges(),
         accuracy=_number(metrics.accuracy(pairs, evidence.verified)),
         recall=_number(metrics.recall(pairs, evidence.truth)),
         components=len(sizes),
         largest_component=max(sizes),
+        articulation_images=len(set(nx.articulation_points(graph))),
+        bridges=sum(1 for _ in nx.bridges(graph)),
     )
-
-
-def _component_sizes(names: Sequence[str], pairs: set[Pair]) -> list[int]:
-    index = {name: i for i, name in enumerate(names)}
-    ends = np.array([(index[a], index[b]) for a, b in sorted(pairs)], np.int64).reshape(-1, 2)
-    shape = (len(names), len(names))
-    graph = sparse.coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=shape)
-    _, labels = sparse.csgraph.connected_components(graph, directed=False)
-    return np.bincount(labels).tolist()
 
 
 def _left_out(ranking: Ranking) -> list[str]:

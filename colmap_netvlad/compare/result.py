@@ -11,7 +11,7 @@ from typing import Any
 from colmap_netvlad.errors import InputError
 from colmap_netvlad.files import write_atomically
 
-FORMAT = 1
+FORMAT = 2
 """Version of `compare.json`."""
 
 EXHAUSTIVE = "exhaustive"
@@ -35,6 +35,7 @@ class RetrievalFigures:
         recall: share of the reference's pairs, 0..1; None where the reference is empty.
         components: connected components of the view graph, single images included.
         largest_component: images in the largest of them.
+        articulation_images, bridges: images and connections whose loss splits a component.
     """
 
     k: int
@@ -44,6 +45,8 @@ class RetrievalFigures:
     recall: float | None
     components: int
     largest_component: int
+    articulation_images: int
+    bridges: int
 
 
 @dataclass(frozen=True)

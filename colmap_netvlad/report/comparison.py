@@ -21,6 +21,7 @@ WIDEST = 1000
 
 RETRIEVAL_COLUMNS = (
     "pairs", "correct", "accuracy", "recall", "components", "largest_component",
+    "articulation_images", "bridges",
 )  # fmt: skip
 
 

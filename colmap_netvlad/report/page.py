@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
+import networkx as nx
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
@@ -14,7 +15,7 @@ from colmap_netvlad.compare.evidence import Evidence
 from colmap_netvlad.compare.figures import FULL_RANKING
 from colmap_netvlad.compare.finds import single_finds
 from colmap_netvlad.compare.result import Comparison
-from colmap_netvlad.metrics import CORRECT_MATCHES, Pair
+from colmap_netvlad.metrics import CORRECT_MATCHES, Pair, as_pair
 from colmap_netvlad.report import plots
 from colmap_netvlad.report.comparison import notes_of, reference_sentence
 from colmap_netvlad.report.examples import (
@@ -36,6 +37,19 @@ class Figure:
     image: str
     alt: str
     caption: str
+
+
+WEAK_POINTS = 12
+"""Articulation images and bridges that the page lists of each method."""
+
+
+@dataclass(frozen=True)
+class WeakPoints:
+    """Where the view graph of a method splits if one image or one connection is lost."""
+
+    method: str
+    images: list[str]
+    bridges: list[Pair]
 
 
 def render_page(comparison: Comparison, evidence: Evidence) -> str:
@@ -66,6 +80,8 @@ def render_page(comparison: Comparison, evidence: Evidence) -> str:
         layout=layout,
         not_placed=int((~layout.placed).sum()),
         graphs=_view_graphs(comparison, evidence, layout),
+        weak=_weak_points(comparison, evidence),
+        most_weak=WEAK_POINTS,
         plans=_model_plans(comparison, evidence, layout),
         examples=choose_examples(evidence),
         partners_shown=PARTNERS,
@@ -133,6 +149,21 @@ def _view_graphs(comparison: Comparison, evidence: Evidence, layout: Layout) -> 
         alt = f"View graph of {method.name} on the ground plan: {words}."
         figures.append(Figure(method.name, data_uri("image/png", picture), alt, words))
     return figures
+
+
+def _weak_points(comparison: Comparison, evidence: Evidence) -> list[WeakPoints]:
+    weak = []
+    for method in comparison.methods:
+        figures = method.best_k
+        if figures and (figures.articulation_images or figures.bridges):
+            graph = evidence.view_graph(evidence.pairs[method.name])
+            images = sorted(set(nx.articulation_points(graph)))
+            weak.append(
+                WeakPoints(
+                    method.name, images, sorted(as_pair(*edge) for edge in nx.bridges(graph))
+                )
+            )
+    return weak
 
 
 def _model_plans(comparison: Comparison, evidence: Evidence, layout: Layout) -> list[Figure]:

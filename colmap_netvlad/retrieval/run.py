@@ -7,7 +7,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from colmap_netvlad.connect import components
+from colmap_netvlad.connect import (
+    apart_lines,
+    component_names,
+    components,
+    connecting_budget,
+    connecting_pairs,
+)
 from colmap_netvlad.database import image_names, open_database
 from colmap_netvlad.errors import InputError
 from colmap_netvlad.models.catalogue import CATALOGUE, DEFAULT
@@ -20,6 +26,7 @@ from colmap_netvlad.pairs import (
     write_pairs,
 )
 from colmap_netvlad.project import Project
+from colmap_netvlad.retrieval.fusion import similarity_matrix
 from colmap_netvlad.retrieval.hybrid import fusion_depth
 from colmap_netvlad.retrieval.methods import RetrievalOptions, rank
 from colmap_netvlad.retrieval.partners import (
@@ -44,6 +51,8 @@ class PairsReport:
         ranking: what the pairs were taken from, k deep.
         pairs: the union of every image's own k partners.
         components: image names of each connected component of the pairs, largest first.
+        connecting: pairs between components that were added because each image's own k partners
+            do not connect all images.
         output: the pairs list that holds every pair.
         colmap_list: the list for COLMAP, where it cannot hold all pairs and so differs from
             `output`; else None.
@@ -58,6 +67,7 @@ class PairsReport:
     colmap_list: Path | None
     unwritable: list[str]
     has_features: bool = False
+    connecting: int = 0
 
 
 def make_pairs(
@@ -67,6 +77,7 @@ def make_pairs(
     format: str = "colmap",
     output: Path | None = None,
     rules: PartnerRules = NO_RULES,
+    connect: bool = True,
 ) -> PairsReport:
     """Retrieve each image's k nearest partners and write the union as a pairs list.
 
@@ -83,6 +94,8 @@ def make_pairs(
             the same name ending in .csv.
         rules: cameras, sequences and pairs the user knows of; photos of one rig frame are never
             paired.
+        connect: where the k nearest leave the images in several components, add the best pairs
+            between these, at most `connecting_budget` of them.
 
     Raises:
         InputError: anything in the input a user can mend.
@@ -98,6 +111,9 @@ def make_pairs(
     ranking = _rank_by_rules(project, method, options, rules)
     pairs = join_pairs(union_of_top(ranking, ranking.depth), extra, names)
     _remember(project, ranking)
+    found = len(pairs)
+    if connect:
+        pairs = _connect(project, method, options, ranking, pairs)
     unwritable = write_pairs(output, pairs, format)
     colmap_list = None
     if unwritable:
@@ -108,11 +124,12 @@ def make_pairs(
     return PairsReport(
         ranking,
         pairs,
-        _components(ranking, pairs),
+        component_names(names, [(pair.name1, pair.name2) for pair in pairs]),
         output,
         colmap_list,
         unwritable,
         has_features,
+        len(pairs) - found,
     )
 
 
@@ -129,11 +146,42 @@ def _rank_by_rules(
         ranking = rank(project, method, options)
         return ranking if ranking.method == "exhaustive" else ranking.top(k)
     # What the rules take out must be replaced from further down.
-    ranking = rank(project, method, replace(options, k=min(fusion_depth(k), len(images) - 1)))
-    if is_rig:
-        ranking = without_same_frame(ranking, [frames.get(image.image_id) for image in images])
+    ranking = _rank_deeply(project, method, options)
     cameras = [image.camera_id for image in images]
     return with_camera_quota(ranking, cameras, k, rules.other_cameras)
+
+
+def _rank_deeply(project: Project, method: str, options: RetrievalOptions) -> Ranking:
+    """Rank further down than k, without partners of an image's own rig frame."""
+    with open_database(project.database) as database:
+        images = database.images()
+        frames = database.frames()
+    deeper = replace(options, k=min(fusion_depth(options.k), len(images) - 1))
+    ranking = rank(project, method, deeper)
+    return without_same_frame(ranking, [frames.get(image.image_id) for image in images])
+
+
+def _connect(
+    project: Project,
+    method: str,
+    options: RetrievalOptions,
+    ranking: Ranking,
+    pairs: list[ImagePair],
+) -> list[ImagePair]:
+    """Return the pairs with the best ones between their components added, if there are several."""
+    names = ranking.names
+    index = {name: i for i, name in enumerate(names)}
+    chosen = [(index[pair.name1], index[pair.name2]) for pair in pairs]
+    component = components(len(names), chosen)
+    if ranking.method == "exhaustive" or not component.any():
+        return pairs
+    deep = _rank_deeply(project, method, options)
+    candidates = {(p.name1, p.name2): p for p in union_of_top(deep, deep.depth)}
+    added = connecting_pairs(
+        similarity_matrix(deep), component, chosen, names, connecting_budget(len(pairs))
+    )
+    links = [candidates[names[i], names[j]] for i, j in added]
+    return sorted([*pairs, *links], key=lambda pair: (index[pair.name1], index[pair.name2]))
 
 
 def _extra_pairs(names: Sequence[str], rules: PartnerRules) -> list[tuple[str, str]]:
@@ -141,10 +189,6 @@ def _extra_pairs(names: Sequence[str], rules: PartnerRules) -> list[tuple[str, s
     if rules.own_pairs is not None:
         extra += read_pairs(rules.own_pairs, names)
     return extra
-
-
-MOST_LISTED = 10
-"""Images listed by name for each component apart."""
 
 
 def summary(project: Project, report: PairsReport) -> list[str]:
@@ -157,7 +201,7 @@ def summary(project: Project, report: PairsReport) -> list[str]:
         f"Description  {ranking.seconds_describe:.1f} s",
         f"Search       {ranking.seconds_search:.1f} s",
         *(f"Note         {note}" for note in ranking.notes),
-        *_component_lines(report.components),
+        *_component_lines(report),
         f"Written      {report.output}",
     ]
     if report.colmap_list is not None:
@@ -174,17 +218,21 @@ def summary(project: Project, report: PairsReport) -> list[str]:
     return [*lines, f"Next         {_next_command(project, report)}"]
 
 
-def _component_lines(groups: list[list[str]]) -> list[str]:
+def _component_lines(report: PairsReport) -> list[str]:
+    groups, lines = report.components, []
+    if report.connecting:
+        lines.append(
+            f"Connecting   {report.connecting} pairs added between components that each image's "
+            f"{report.ranking.depth} nearest leave apart (--no-connect: none)"
+        )
     if len(groups) == 1:
-        return ["Components   1: the pairs connect all images"]
-    lines = [
+        return [*lines, "Components   1: the pairs connect all images"]
+    return [
+        *lines,
         f"Components   {len(groups)}: the pairs do not connect all images; a larger --k may. "
-        f"The largest has {len(groups[0])} images; apart from it are:"
+        f"The largest has {len(groups[0])} images; apart from it are:",
+        *(f"             {line}" for line in apart_lines(groups)),
     ]
-    for group in groups[1:]:
-        more = f", and {len(group) - MOST_LISTED} more" if len(group) > MOST_LISTED else ""
-        lines.append(f"             {len(group)}: {', '.join(group[:MOST_LISTED])}{more}")
-    return lines
 
 
 def _next_command(project: Project, report: PairsReport) -> str:
@@ -207,14 +255,3 @@ def _remember(project: Project, ranking: Ranking) -> None:
             store.remember_images(project.images)
         if ranking.method != "exhaustive":  # all pairs in order say nothing worth keeping
             store.save_ranking(ranking)
-
-
-def _components(ranking: Ranking, pairs: list[ImagePair]) -> list[list[str]]:
-    index = {name: i for i, name in enumerate(ranking.names)}
-    labels = components(
-        len(ranking.names), ((index[pair.name1], index[pair.name2]) for pair in pairs)
-    )
-    groups: list[list[str]] = [[] for _ in range(int(labels.max()) + 1)]
-    for name, label in zip(ranking.names, labels.tolist(), strict=True):
-        groups[label].append(name)
-    return groups
