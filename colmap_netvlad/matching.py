@@ -234,8 +234,11 @@ def _copy_features(source: Path, target: Path, aliases: dict[int, str]) -> None:
 
 def _copy_matches(source: Path, target: Path, pairs: Sequence[int]) -> None:
     """Copy the results of some pairs whole or not at all."""
-    with closing(sqlite3.connect(target, timeout=LOCK_SECONDS)) as connection:
+    with closing(sqlite3.connect(target, timeout=LOCK_SECONDS, isolation_level=None)) as connection:
         connection.execute("ATTACH ? AS source", (f"{source.resolve()}",))
+        # A transaction that reads before it writes fails at once where another process has
+        # written in between; one that starts as a writer waits for its turn.
+        connection.execute("BEGIN IMMEDIATE")
         connection.execute("CREATE TEMP TABLE wanted (pair_id INTEGER PRIMARY KEY)")
         connection.executemany("INSERT INTO wanted VALUES (?)", [(pair,) for pair in pairs])
         for table in ("matches", "two_view_geometries"):

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import itertools
 import sqlite3
+import threading
+import time
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
@@ -103,6 +105,29 @@ def test_several_processes_give_the_same_matches_as_one(
     report = match_pairs(two, some_pairs(two, 6), MatchOptions(processes=3))
     assert report.matched == 15
     assert results(one) == results(two) and len(results(two)) == 15
+
+
+def test_a_process_waits_while_another_writes(project_copy: MakeProject) -> None:
+    database = project_copy(matched=True).database
+    target = project_copy(name="target").database
+    ready = threading.Event()
+
+    def write_slowly() -> None:
+        with closing(sqlite3.connect(target, isolation_level=None)) as other:
+            other.execute("PRAGMA journal_mode = WAL")
+            other.execute("BEGIN IMMEDIATE")
+            other.execute("INSERT INTO matches (pair_id, rows, cols) VALUES (?, 0, 2)", (one,))
+            ready.set()
+            time.sleep(0.5)
+            other.execute("COMMIT")
+
+    one, two = sorted(results(database))[:2]
+    thread = threading.Thread(target=write_slowly)
+    thread.start()
+    ready.wait()
+    matching._copy_matches(database, target, [two])
+    thread.join()
+    assert results(target)[two] == results(database)[two]
 
 
 def test_a_failing_process_is_said_and_leaves_what_is_matched(
