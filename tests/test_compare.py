@@ -369,3 +369,10 @@ def test_every_key_has_its_own_file_name():
     keys = ["netvlad-o", "a/b", "a-b", "a b", "ü", "o", "../x", "."]
     assert len({file_name(key) for key in keys}) == len(keys)
     assert all("/" not in file_name(key) and file_name(key)[0] != "." for key in keys)
+
+
+@pytest.mark.parametrize("name", ["hybrid", "netvlad-o-lite"])
+def test_methods_that_run_a_shipped_model_are_compared(no_page, project_copy: Make, name):
+    comparison, _ = compare(project_copy(), [name, "vlad"], FAST)
+    assert not comparison.incomplete
+    assert comparison.methods[0].name == name and comparison.methods[0].at_k[0].pairs > 0

@@ -31,7 +31,7 @@ from colmap_netvlad.metrics import Pair, as_pair
 from colmap_netvlad.pairs import check_k, union_of_top
 from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval import deep
-from colmap_netvlad.retrieval.methods import Method, RetrievalOptions, find_method, rank
+from colmap_netvlad.retrieval.methods import RetrievalOptions, find_method, rank
 
 ASK_ABOVE = 600.0
 """Exhaustive matching that is estimated to take longer than this, s, is asked about first."""
@@ -213,7 +213,7 @@ def _rank(
     depth = count - 1 if count <= FULL_RANKING else ks[-1]
     retrieval = replace(options.retrieval, k=depth, seed=options.seed)
     try:
-        key = _ranking_key(candidate.text, find_method(candidate.text), retrieval)
+        key = _ranking_key(candidate.text, retrieval)
         kept = workspace.load_ranking(key)
         if kept is None:
             progress.console.print(f"Ranking by {candidate.name}", highlight=False)
@@ -227,13 +227,14 @@ def _rank(
         candidate.failed = _reason(fault)
 
 
-def _ranking_key(text: str, method: Method, options: RetrievalOptions) -> str:
+def _ranking_key(text: str, options: RetrievalOptions) -> str:
     """Everything a ranking of the same features depends on."""
+    method = find_method(text)
     key = f"{text}-k{options.k}-seed{options.seed}"
     if options.vocab_tree is not None and method.name == "bow":
         key += f"-{options.vocab_tree.resolve()}-{options.vocab_tree.stat().st_mtime_ns}"
-    if "photos" in method.needs:
-        key += f"-{deep.model_fingerprint(deep.checkpoint_file(text))}"
+    if method.model is not None:
+        key += f"-{deep.model_fingerprint(deep.checkpoint_file(method.model))}"
     return key
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from colmap_netvlad.database import image_names
 from colmap_netvlad.errors import InputError
-from colmap_netvlad.models.catalogue import CATALOGUE
+from colmap_netvlad.models.catalogue import CATALOGUE, DEFAULT
 from colmap_netvlad.pairs import check_k
 from colmap_netvlad.positions import Positions, read_positions
 from colmap_netvlad.project import Project
@@ -63,6 +63,7 @@ class Method:
         needs: of "photos", "features", "positions".
         rank: ranks the images of a project by appearance (or, for `spatial`, by position).
         gps: whether positions join in by themselves.
+        model: the deep model it runs: a name of the catalogue or a checkpoint file.
     """
 
     name: str
@@ -70,13 +71,14 @@ class Method:
     needs: frozenset[str]
     rank: Callable[[Project, RetrievalOptions], Ranking]
     gps: bool = False
+    model: str | Path | None = None
 
 
 def _deep_method(name: str, summary: str, checkpoint: str | Path) -> Method:
     def rank_deep(project: Project, options: RetrievalOptions) -> Ranking:
         return deep.rank(project, checkpoint, options)
 
-    return Method(name, summary, frozenset({"photos"}), rank_deep)
+    return Method(name, summary, frozenset({"photos"}), rank_deep, model=checkpoint)
 
 
 METHODS: dict[str, Method] = {
@@ -102,6 +104,7 @@ METHODS: dict[str, Method] = {
             frozenset({"photos", "features"}),
             hybrid.rank,
             gps=True,
+            model=DEFAULT,
         ),
         Method(
             "spatial",
