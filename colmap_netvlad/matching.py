@@ -1,6 +1,6 @@
 """Pairs -> matches and two-view geometries in the database, through pycolmap.
 
-Pairs are matched in chunks of a few seconds, each written when done: a stopped run loses one
+Pairs are matched in chunks of half a minute, each written when done: a stopped run loses one
 chunk a process at most, and the next run goes on with the rest.
 
 COLMAP's CPU matcher searches with faiss, whose k-means in several threads of one process at
@@ -19,7 +19,10 @@ from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import pycolmap
+from scipy import sparse
+from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from colmap_netvlad import engine, progress, workers
 from colmap_netvlad.database import open_database, pair_id
@@ -28,12 +31,15 @@ from colmap_netvlad.errors import InputError
 FIRST_CHUNK = 32
 """Pairs of the first chunk; the next ones are sized to take `CHUNK_SECONDS`."""
 
-CHUNK_SECONDS = 5.0
+CHUNK_SECONDS = 30.0
 MAX_CHUNK = 4096
 
-BLOCK = 64
-"""Processes take turns by blocks of this many pairs: neighbours in the list share images, and
-all processes get their share of the pairs that are slow."""
+TILE = 16
+"""Pairs between the same two groups of this many images are matched together: COLMAP indexes an
+image once a chunk, which takes longer than to match a pair."""
+
+BLOCK = 128
+"""Processes take turns by blocks of this many pairs, so that all get their share of slow ones."""
 
 WORTH_A_PROCESS = 128
 """Fewer pairs than this take less time than a process takes to start."""
@@ -100,14 +106,13 @@ def match_pairs(
         raise InputError(
             f"No image in {database} has features; extract them with `colmap-netvlad features`."
         )
-    # In the order of ids, neighbours in the list share an image that COLMAP then has in memory.
     requested = sorted({_sorted_ids(ids[a], ids[b]) for a, b in pairs if a != b})
     todo = [pair for pair in requested if pair not in done]
     start = time.monotonic()
     if todo:
         pycolmap.Database.open(database).close()  # brings an old schema up to date
         with progress.step("Matching pairs", len(todo)) as bar:
-            _match_all(database, todo, options, bar.advance)
+            _match_all(database, _in_tiles(todo), options, bar.advance)
     seconds = time.monotonic() - start
     with open_database(database) as colmap:
         verified = colmap.verified_matches()
@@ -125,6 +130,18 @@ IdPair = tuple[int, int]
 
 def _sorted_ids(id1: int, id2: int) -> IdPair:
     return (id1, id2) if id1 < id2 else (id2, id1)
+
+
+def _in_tiles(pairs: Sequence[IdPair]) -> list[IdPair]:
+    """Return the pairs in an order in which neighbours in the list share images."""
+    ids = np.unique(pairs)
+    ends = np.searchsorted(ids, pairs)
+    graph = sparse.coo_array((np.ones(len(ends)), tuple(ends.T)), shape=(len(ids), len(ids)))
+    order = reverse_cuthill_mckee((graph + graph.T).tocsr(), symmetric_mode=True)
+    place = np.empty(len(ids), np.int64)
+    place[order] = np.arange(len(ids))
+    tiles = np.sort(place[ends], axis=1) // TILE
+    return [pairs[i] for i in np.lexsort((ends[:, 1], ends[:, 0], tiles[:, 1], tiles[:, 0]))]
 
 
 def _match_all(

@@ -12,6 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from colmap_netvlad import engine, matching, workers
 from colmap_netvlad.database import image_names, open_database, pair_id
@@ -209,3 +211,21 @@ def test_one_image_without_features_fails_its_pairs_only(project_copy: MakeProje
     with open_database(database) as colmap:
         assert colmap.verified_matches().get((1, 2), 0) == 0
     assert pair_id(2, 3) in results(database)
+
+
+@given(st.sets(st.tuples(st.integers(1, 90), st.integers(1, 90)), min_size=1, max_size=300))
+def test_the_order_of_matching_keeps_every_pair_once(pairs: set[tuple[int, int]]) -> None:
+    asked = sorted({(min(pair), max(pair)) for pair in pairs if pair[0] != pair[1]} | {(1, 2)})
+    assert sorted(matching._in_tiles(asked)) == asked
+
+
+def test_neighbours_in_the_list_share_images() -> None:
+    shuffled = [i * 37 % 101 for i in range(101)]  # a flight line under names in any order
+    line = [(shuffled[i], shuffled[j]) for i in range(101) for j in range(i + 1, min(i + 9, 101))]
+    pairs = sorted((min(pair), max(pair)) for pair in line)
+
+    def indexed(order: list[tuple[int, int]]) -> int:
+        chunks = [order[at : at + 100] for at in range(0, len(order), 100)]
+        return sum(len({image for pair in chunk for image in pair}) for chunk in chunks)
+
+    assert indexed(matching._in_tiles(pairs)) < 0.5 * indexed(pairs)
