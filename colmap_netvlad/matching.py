@@ -149,34 +149,23 @@ def _match_all(
 ) -> None:
     most = 1 if pycolmap.has_cuda else options.processes or engine.usable_processors()
     count = max(1, min(most, len(pairs) // WORTH_A_PROCESS))
-    with tempfile.TemporaryDirectory(prefix="colmap-netvlad-") as folder:
-        if count == 1:
-            _match_in_chunks(advance, database, Path(folder), pairs, options.seed)
-        else:
-            _match_in_processes(count, advance, database, Path(folder), pairs, options.seed)
-
-
-def _match_in_processes(
-    count: int,
-    advance: Callable[[int], None],
-    database: Path,
-    folder: Path,
-    pairs: Sequence[IdPair],
-    seed: int,
-) -> None:
     blocks = [pairs[at : at + BLOCK] for at in range(0, len(pairs), BLOCK)]
-    jobs = []
-    for number in range(count):
-        own = folder / f"{number}"
-        own.mkdir()
-        share = [pair for block in blocks[number::count] for pair in block]
-        jobs.append(workers.Job(_match_in_chunks, (database, own, share, seed)))
-    for outcome in workers.run(jobs, count, advance):
-        if outcome.fault:
-            raise InputError(
-                f"Matching stopped: {outcome.fault.rstrip('.')}. What is matched stays in "
-                f"{database}; run the command again to go on."
-            )
+    with tempfile.TemporaryDirectory(prefix="colmap-netvlad-") as folder:
+        jobs = []
+        for number in range(count):
+            own = Path(folder, f"{number}")
+            own.mkdir()
+            share = [pair for block in blocks[number::count] for pair in block]
+            jobs.append(workers.Job(_match_in_chunks, (database, own, share, options.seed)))
+        if count == 1:
+            _match_in_chunks(advance, *jobs[0].arguments)
+            return
+        for outcome in workers.run(jobs, count, advance):
+            if outcome.fault:
+                raise InputError(
+                    f"Matching stopped: {outcome.fault.rstrip('.')}. What is matched stays in "
+                    f"{database}; run the command again to go on."
+                )
 
 
 def _match_in_chunks(
