@@ -27,7 +27,7 @@ from colmap_netvlad.retrieval.deep import BATCH_SIZE
 from colmap_netvlad.retrieval.methods import RetrievalOptions, rank
 
 SCENE = Path(__file__).parents[1] / ".." / "shared" / "data" / "sheffield_cross"
-MODELS = ("netvlad-imagenet", "netvlad-lite-imagenet")
+MODELS = ("netvlad-o", "netvlad-o-lite")
 
 
 def decoding_seconds(images: Path, names: list[str], long_side: int) -> float:

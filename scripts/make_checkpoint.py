@@ -3,9 +3,10 @@
 
 It is what training starts from, and what runs until a trained model is there:
 
-    python scripts/make_checkpoint.py --name netvlad-imagenet --backbone vgg16 \
-        --weights vgg16-imagenet.safetensors --long-side 320 --rotations 4 \
-        --output netvlad-imagenet.safetensors flights/scene1 flights/scene2
+    python scripts/make_checkpoint.py --name netvlad-lite-imagenet \
+        --backbone efficientnet-lite0-stage5 --weights efficientnet-lite0-imagenet.safetensors \
+        --long-side 384 --rotations 4 \
+        --output netvlad-lite-imagenet.safetensors flights/scene1 flights/scene2
 
 Every FOLDER is searched for photos, itself and below.
 """

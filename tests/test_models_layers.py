@@ -9,6 +9,7 @@ import torch
 from colmap_netvlad.errors import InputError
 from colmap_netvlad.models.aggregation import (
     ASSIGNMENT_RATIO,
+    AdaptedNetVLAD,
     GeM,
     MaxPool,
     NetVLAD,
@@ -98,6 +99,23 @@ def test_netvlad_starts_the_same_twice(random):
     first.initialise(features, seed=1)
     second.initialise(features, seed=1)
     assert torch.equal(first.centres, second.centres)
+
+
+def test_adapted_netvlad_starts_as_netvlad(random):
+    features = random.normal(1, 1, size=(400, 7)).astype(np.float32)
+    plain, adapted = NetVLAD(7, 5), AdaptedNetVLAD(7, 5)
+    assert plain.initialise(features) == pytest.approx(adapted.initialise(features), rel=1e-3)
+    photos = torch.from_numpy(random.normal(1, 1, size=(2, 7, 3, 4)).astype(np.float32))
+    with torch.no_grad():
+        torch.testing.assert_close(plain(photos), adapted(photos), atol=1e-3, rtol=0)
+
+
+def test_adapted_netvlad_keeps_its_scale_when_its_centres_are_found_again(random):
+    layer = AdaptedNetVLAD(7, 5)
+    layer.initialise(random.normal(1, 1, size=(400, 7)))
+    mean, spread = layer.mean.clone(), layer.spread.clone()
+    layer.initialise(random.normal(-3, 2, size=(400, 7)))
+    assert torch.equal(mean, layer.mean) and torch.equal(spread, layer.spread)
 
 
 def test_gem_equals_equation_17(random):

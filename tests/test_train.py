@@ -18,7 +18,7 @@ from colmap_netvlad.errors import InputError
 from colmap_netvlad.images import photo_fingerprint
 from colmap_netvlad.models.aggregation import build_aggregation
 from colmap_netvlad.models.backbones import build_trunk
-from colmap_netvlad.models.checkpoint import load_model, read_metadata
+from colmap_netvlad.models.checkpoint import load_model, load_network, read_metadata
 from colmap_netvlad.models.network import GlobalDescriptor
 from colmap_netvlad.training import history as history_module
 from colmap_netvlad.training import run as run_module
@@ -137,13 +137,26 @@ def _die_after(monkeypatch: pytest.MonkeyPatch, steps: int) -> None:
             "loss": "softmax",
             "keep_local": 0.5,
             "warm_up": 2,
-            "aggregation": "netvlad-tuned",
             "assignment": 20.0,
+        },
+        {
+            "loss": "correspondence",
+            "aggregation": "netvlad-adapted",
+            "mining": "flight",
+            "pseudo_views": 4,
+            "points": 30,
+            "frozen": "block9",
         },
         {"mining": "global", "loss": "triplet"},
         {"aggregation": "gem", "pseudo_views": 4, "teacher": "start", "frozen": "block9"},
     ],
-    ids=["new views", "kept features of flights", "global mining", "pseudo-scenes and teacher"],
+    ids=[
+        "new views",
+        "kept features of flights",
+        "correspondences",
+        "global mining",
+        "pseudo-scenes and teacher",
+    ],
 )
 def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(
     settings: dict[str, object],
@@ -234,26 +247,43 @@ def test_frozen_stages_stay_and_the_others_move(
     assert not any("running" in key for key in moved), "statistics of batch norms stay"
 
 
-def test_tuned_netvlad_starts_as_netvlad_and_moves_at_its_own_rates(
+def test_correspondences_teach_the_local_features_and_the_centres_follow(
     flights: list[Scene], options: TrainOptions, tmp_path: Path
 ) -> None:
-    """The layer's extra parameters do nothing at first; their rates are factors of the table."""
-    torch.manual_seed(0)
-    centres, features = torch.randn(4, 112), torch.randn(2, 112, 3, 5)
-    described = []
-    for kind in ("netvlad", "netvlad-tuned"):
-        layer = build_aggregation(112, {"kind": kind, "clusters": 4})
-        layer.init_from_centres(centres, 20.0)
-        described.append(layer(features))
-    assert torch.allclose(described[0], described[1], atol=1e-5)
-    options = change(options, aggregation="netvlad-tuned", assignment=20.0, frozen="block10")
-    tuned = Run(flights[:2], [], change(options, head_rate=2.0), tmp_path / "run")
+    options = change(
+        options,
+        loss="correspondence",
+        aggregation="netvlad-adapted",
+        mining="flight",
+        pseudo_views=6,
+        pseudo_share=1.0,
+        scenes_per_batch=4,
+        frozen="block10",
+        views=2,
+        epochs=3,
+        iterations=10,
+        noise=0.0,
+    )
+    report = train(flights[:2], flights[2:], options, tmp_path / "run")
+    losses = [entry.loss for entry in report.history[1:]]
+    assert losses[-1] < losses[0]
+    first, last = (load_network(tmp_path / "run" / f"{n}.safetensors") for n in ("initial", "last"))
+    assert not first.aggregation.adapt[-1].weight.any(), "it starts as NetVLAD"
+    assert last.aggregation.adapt[-1].weight.any()
+    assert not torch.equal(first.aggregation.centres, last.aggregation.centres)
+    assert torch.equal(first.aggregation.mean, last.aggregation.mean)
+
+
+def test_head_rate_is_a_factor_on_the_layers_learning_rate(
+    flights: list[Scene], options: TrainOptions, tmp_path: Path
+) -> None:
+    run = Run(flights[:2], [], change(options, head_rate=2.0), tmp_path / "run")
     factor_of = {
-        id(p): group["factor"] for group in tuned.optimizer.param_groups for p in group["params"]
+        id(p): group["factor"] for group in run.optimizer.param_groups for p in group["params"]
     }
-    layer = tuned.network.network.aggregation
-    assert factor_of[id(layer.projection)] == 2.0 and factor_of[id(layer.hardness_log)] == 60.0
-    assert len(factor_of) == len(list(layer.parameters()))
+    assert factor_of.pop(id(run.network.network.aggregation.centres)) == 2.0
+    assert factor_of.pop(id(run.network.network.aggregation.assignment)) == 2.0
+    assert set(factor_of.values()) == {1.0}
 
 
 @pytest.mark.parametrize("name", ["vgg16", "resnet50", LITE, "efficientnet-lite0-stage7"])

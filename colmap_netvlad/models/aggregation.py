@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import types
-from collections.abc import Mapping
 from typing import Any
 
 import faiss
@@ -26,12 +24,10 @@ class Aggregation(nn.Module):
     Attributes:
         kind: its row in `AGGREGATIONS`.
         dim: length of the vector.
-        rates: factors on the learning rate, by parameter; 1 where absent.
     """
 
     kind: str
     dim: int
-    rates: Mapping[str, float] = types.MappingProxyType({})
 
     def options(self) -> dict[str, Any]:
         """What a checkpoint needs to build the layer again, beside the channels."""
@@ -61,12 +57,16 @@ class NetVLAD(Aggregation):
         """See `Aggregation`."""
         return {"kind": self.kind, "clusters": self.clusters}
 
+    def local(self, features: Tensor) -> Tensor:
+        """Features (B, D, N) to what is assigned and summed: the same, L2-normalised."""
+        return functional.normalize(features.float(), dim=1)
+
     def forward(self, features: Tensor) -> Tensor:
         """Features (B, D, h, w) to descriptors (B, K D), cluster by cluster."""
         # Float32 throughout, whatever the trunk's precision: it is little work, and sums over
         # a thousand features do not survive half precision.
         with torch.autocast(features.device.type, enabled=False):
-            x = functional.normalize(features.float().flatten(2), dim=1)  # (B, D, N)
+            x = self.local(features.flatten(2))  # (B, D, N)
             assigned = torch.softmax(self.assignment.float() @ x, dim=1)  # (B, K, N), eq. 16
             # Eq. 14 as sum_i a_ik x_i - c_k sum_i a_ik: nothing of size B x K x N x D.
             mass = assigned.sum(dim=2, keepdim=True)  # (B, K, 1)
@@ -117,63 +117,56 @@ class NetVLAD(Aggregation):
         return alpha
 
 
-class TunedNetVLAD(NetVLAD):
-    """NetVLAD that a few hundred photos can tune, on a trunk that stays frozen.
+class AdaptedNetVLAD(NetVLAD):
+    """NetVLAD behind a small network that adapts every local feature by itself.
 
-    Beside the paper's: a linear map of the L2-normalised features in front, started at the
-    identity; the bias b_k of eq. 16; and a weight of each cluster after intra-normalisation.
-    Scales, hardness and weights are learned as logarithms.
+    y = normalise(x + g(z)), where x is the L2-normalised feature and z = (x - mean) / spread; g
+    has two hidden layers and starts at zero, so that the layer starts as NetVLAD. Correspondences
+    teach it (`training.correspondences`): features of one point of the ground come together
+    whatever way the camera turned, features of others part.
 
     Attributes:
-        projection, offset, scale_log: x -> exp(scale) (projection x) + offset, (D, D), (D,), (D,).
-        hardness_log: log alpha; `assignment` holds the directions c_k / |c_k|.
-        assignment_bias: b_k, (K,).
-        weight_log: (K,).
+        mean, spread: of the features it started from, (D,) and ().
+        adapt: g, (..., D) to (..., D).
     """
 
-    kind = "netvlad-tuned"
-    rates = types.MappingProxyType(
-        {
-            "centres": 2.0,
-            "assignment": 2.0,
-            "assignment_bias": 10.0,
-            "hardness_log": 30.0,
-            "weight_log": 30.0,
-            "scale_log": 30.0,
-        }
-    )
+    kind = "netvlad-adapted"
 
-    def __init__(self, channels: int, clusters: int = 64) -> None:
+    def __init__(self, channels: int, clusters: int = 64, hidden: int = 512) -> None:
         super().__init__(channels, clusters)
-        self.projection = nn.Parameter(torch.eye(channels))
-        self.offset = nn.Parameter(torch.zeros(channels))
-        self.scale_log = nn.Parameter(torch.zeros(channels))
-        self.hardness_log = nn.Parameter(torch.zeros(()))
-        self.assignment_bias = nn.Parameter(torch.zeros(clusters))
-        self.weight_log = nn.Parameter(torch.zeros(clusters))
+        self.hidden = hidden
+        self.mean: Tensor
+        self.spread: Tensor
+        self.register_buffer("mean", torch.zeros(channels))
+        self.register_buffer("spread", torch.ones(()))
+        last = nn.Linear(hidden, channels)
+        nn.init.zeros_(last.weight)
+        nn.init.zeros_(last.bias)
+        self.adapt = nn.Sequential(
+            nn.Linear(channels, hidden), nn.GELU(), nn.Linear(hidden, hidden), nn.GELU(), last
+        )
 
-    def forward(self, features: Tensor) -> Tensor:
-        """Features (B, D, h, w) to descriptors (B, K D), cluster by cluster."""
+    def options(self) -> dict[str, Any]:
+        """See `Aggregation`."""
+        return {**super().options(), "hidden": self.hidden}
+
+    def local(self, features: Tensor) -> Tensor:
+        """Features (B, D, N) to adapted ones (B, D, N), L2-normalised."""
         with torch.autocast(features.device.type, enabled=False):
-            x = functional.normalize(features.float().flatten(2), dim=1)  # (B, D, N)
-            scale = self.scale_log.float().exp()[:, None]
-            x = functional.normalize(
-                (scale * self.projection.float()) @ x + self.offset.float()[:, None], dim=1
-            )
-            hardness = self.hardness_log.float().exp()
-            logits = hardness * (self.assignment.float() @ x)
-            assigned = torch.softmax(logits + self.assignment_bias.float()[:, None], dim=1)
-            mass = assigned.sum(dim=2, keepdim=True)  # (B, K, 1)
-            residuals = assigned @ x.transpose(1, 2) - mass * self.centres.float()  # (B, K, D)
-            residuals = functional.normalize(residuals, dim=2)
-            residuals = residuals * self.weight_log.float().exp()[:, None]
-            return functional.normalize(residuals.flatten(1), dim=1)
+            x = functional.normalize(features.float(), dim=1).transpose(1, 2)  # (B, N, D)
+            spread = self.spread.float()
+            adapted = x / spread + self.adapt((x - self.mean.float()) / spread)
+            return functional.normalize(adapted, dim=2).transpose(1, 2)
 
-    @torch.no_grad()
-    def init_from_centres(self, centres: Tensor, alpha: float) -> None:
-        """Set c_k, the directions of w_k, and alpha; the rest stays as it does nothing."""
-        super().init_from_centres(centres, 1.0)
-        self.hardness_log.fill_(math.log(alpha))
+    def initialise(self, features: np.ndarray, seed: int = 0) -> float:
+        """Start as `NetVLAD.initialise`, from adapted features; their mean and spread are kept."""
+        x = functional.normalize(torch.from_numpy(np.array(features, np.float32)), dim=1)
+        with torch.no_grad():
+            if not self.mean.any():
+                self.mean.copy_(x.mean(dim=0))
+                self.spread.copy_(x.std(dim=0).mean())
+            adapted = self.local(x.to(self.mean.device).T[None])[0].T
+        return super().initialise(adapted.cpu().numpy(), seed)
 
 
 class GeM(Aggregation):
@@ -213,7 +206,7 @@ class MaxPool(Aggregation):
 
 
 AGGREGATIONS: dict[str, type[Aggregation]] = {
-    layer.kind: layer for layer in (NetVLAD, TunedNetVLAD, GeM, MaxPool)
+    layer.kind: layer for layer in (NetVLAD, AdaptedNetVLAD, GeM, MaxPool)
 }
 
 

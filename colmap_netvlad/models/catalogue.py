@@ -69,13 +69,14 @@ CATALOGUE: dict[str, ModelEntry] = {
         ModelEntry(
             "netvlad-o-lite",
             "netvlad-o-lite.safetensors",
-            "NetVLAD on EfficientNet-Lite0, its NetVLAD layer tuned on drone flights; fast on a"
-            " laptop.",
+            "NetVLAD on EfficientNet-Lite0, its local features taught by correspondences on drone"
+            " flights; fast on a laptop.",
         ),
         ModelEntry(
-            "netvlad-imagenet",
-            "netvlad-imagenet.safetensors",
-            "NetVLAD on VGG-16 conv5_3, not trained for flights: ImageNet trunk, k-means centres.",
+            "netvlad-o",
+            "netvlad-o.safetensors",
+            "NetVLAD on VGG-16 conv5_3, the paper's network, its local features taught by"
+            " correspondences on drone flights; wants a GPU.",
         ),
         ModelEntry(
             "netvlad-lite-imagenet",

@@ -20,8 +20,12 @@ from colmap_netvlad.training.augment import Augmentation, PseudoOptions
 from colmap_netvlad.training.losses import LOSSES, LossOptions
 from colmap_netvlad.training.sampling import MINING, NEGATIVES, SamplingOptions
 
-ALPHA = {"netvlad": 1.35, "netvlad-tuned": 1.35, "gem": 0.9, "max": 0.9}
+ALPHA = {"netvlad": 1.35, "netvlad-adapted": 1.35, "gem": 0.9, "max": 0.9}
 """Margin alpha of eq. 11 by aggregation (section 4.3.2)."""
+
+
+CORRESPONDENCE = "correspondence"
+"""The loss over local features (`training.correspondences`)."""
 
 
 def setting(default: Any, help: str, **more: Any) -> Any:
@@ -88,13 +92,22 @@ class TrainOptions:
     same_flight: int = setting(0, "Further negatives of the anchor's flight, surely apart.")
 
     # The loss.
-    loss: str = setting("ranked-list", "Loss.", choices=tuple(LOSSES))
+    loss: str = setting(
+        "ranked-list",
+        "Loss over the descriptors of a batch; or correspondence: over the local features of"
+        " points that two views show.",
+        choices=(*LOSSES, CORRESPONDENCE),
+    )
     margin: float = setting(0.1, "m, between positive and negative (eq. 9 and 11).")
     alpha: float | None = setting(
         None, "Radius of eq. 11.  [default: 1.35 for netvlad, else 0.9]", type=float
     )
     contrastive_margin: float = setting(0.7, "Distance at which a negative costs nothing.")
-    temperature: float = setting(0.05, "Temperature of the softmax loss.")
+    temperature: float = setting(0.05, "Temperature of the softmax and correspondence losses.")
+    points: int = setting(384, "Points of each flight in a batch of the correspondence loss.")
+    noise: float = setting(
+        0.3, "Noise on local features in the correspondence loss, in units of their spread."
+    )
     nontrivial: bool = setting(True, "Leave samples of zero loss out of the average.")
     teacher: str | None = setting(
         None,
@@ -138,6 +151,8 @@ class TrainOptions:
             raise InputError(f"scale_max {self.scale_max} is below scale_min {self.scale_min}.")
         if self.rotations not in (1, 4):
             raise InputError(f"rotations is {self.rotations}; it is 1 or 4.")
+        if self.loss == CORRESPONDENCE and "netvlad" not in self.aggregation:
+            raise InputError("The correspondence loss teaches the local features of a NetVLAD.")
         if self.views and self.frozen is None:
             raise InputError(
                 "views keeps frozen features on disk: say with frozen up to where the trunk stays."

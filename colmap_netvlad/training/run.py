@@ -25,6 +25,8 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
+from torch.nn import functional
 
 from colmap_netvlad import progress
 from colmap_netvlad.errors import InputError
@@ -35,10 +37,11 @@ from colmap_netvlad.models.checkpoint import load_model, load_network, save_chec
 from colmap_netvlad.models.describe import choose_device
 from colmap_netvlad.models.network import GlobalDescriptor
 from colmap_netvlad.training.augment import pseudo_scene
+from colmap_netvlad.training.correspondences import correspondence_loss, draw_correspondences
 from colmap_netvlad.training.history import Epoch, write_history
 from colmap_netvlad.training.inputs import Drawn, Inputs, KeptFeatures, Photos
 from colmap_netvlad.training.losses import LOSSES, keep_similarities
-from colmap_netvlad.training.options import TrainOptions
+from colmap_netvlad.training.options import CORRESPONDENCE, TrainOptions
 from colmap_netvlad.training.sampling import Batch, Query, Sampler
 from colmap_netvlad.training.scenes import Scene, check_disjoint
 from colmap_netvlad.training.stages import SplitNetwork
@@ -201,20 +204,11 @@ class Run:
 
     def _train_on(self, batch: Batch, drawn: Drawn) -> float:
         """Take one step of the optimiser and return the loss; NaN where no view has a positive."""
-        options = self.options
-        batch = by_views(batch, self.scenes, drawn.homographies, self.photos.size, options.epsilon)
-        if not batch.queries:
-            return math.nan
         for group in self.optimizer.param_groups:
             group["lr"] = self._rate() * group["factor"]
-        with torch.autocast("cuda", torch.bfloat16, enabled=self.device.type == "cuda"):
-            front = self.inputs.front(self.network, drawn.inputs.to(self.device))
-            rng = np.random.default_rng([options.seed, 2, self.epoch, self.number])
-            descriptors = self.network.rest(front, options.keep_local, rng).float()
-        loss = LOSSES[options.loss](descriptors, batch.queries, options.for_losses())
-        if self.teacher is not None:
-            wanted = self.teacher.similarities(batch.samples).to(self.device)
-            loss = loss + options.teacher_weight * keep_similarities(descriptors, wanted)
+        loss = self._loss(batch, drawn)
+        if loss is None:
+            return math.nan
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         parameters = self.network.trained().values()
@@ -225,6 +219,47 @@ class Run:
             raise InputError(self._nan_sentence(batch))
         self.optimizer.step()
         return loss.item()
+
+    def _loss(self, batch: Batch, drawn: Drawn) -> Tensor | None:
+        """Return the loss of a batch; None where its views have nothing in common."""
+        options = self.options
+        with torch.autocast("cuda", torch.bfloat16, enabled=self.device.type == "cuda"):
+            front = self.inputs.front(self.network, drawn.inputs.to(self.device))
+            if options.loss == CORRESPONDENCE:
+                features = self.network.features(front)
+                return self._correspondence_loss(batch, drawn, features.float())
+            batch = by_views(
+                batch, self.scenes, drawn.homographies, self.photos.size, options.epsilon
+            )
+            if not batch.queries:
+                return None
+            rng = np.random.default_rng([options.seed, 2, self.epoch, self.number])
+            descriptors = self.network.rest(front, options.keep_local, rng).float()
+        loss = LOSSES[options.loss](descriptors, batch.queries, options.for_losses())
+        if self.teacher is not None:
+            wanted = self.teacher.similarities(batch.samples).to(self.device)
+            loss = loss + options.teacher_weight * keep_similarities(descriptors, wanted)
+        return loss
+
+    def _correspondence_loss(self, batch: Batch, drawn: Drawn, features: Tensor) -> Tensor | None:
+        """Return the mean over the scenes of a batch."""
+        options, size = self.options, self.photos.size
+        layer = self.network.network.aggregation
+        assert isinstance(layer, NetVLAD)  # TrainOptions has seen to it
+        rng = np.random.default_rng([options.seed, 2, self.epoch, self.number])
+        losses = []
+        for found in draw_correspondences(
+            batch, self.scenes, drawn.homographies, size, options.points, rng
+        ):
+            spread = functional.normalize(features.detach(), dim=1).std(dim=(0, 2, 3)).mean()
+            noise = torch.from_numpy(
+                rng.standard_normal((2 * len(found), features.shape[1]), np.float32)
+            )
+            noise = options.noise * spread * noise.to(self.device)
+            losses.append(
+                correspondence_loss(features, found, layer, size, options.temperature, noise)
+            )
+        return torch.stack(losses).mean() if losses else None
 
     def _nan_sentence(self, batch: Batch) -> str:
         photos = ", ".join(
@@ -291,6 +326,8 @@ class Run:
     def _end_of_epoch(self, loss: float) -> None:
         options = self.options
         last = self.epoch == options.epochs
+        if options.loss == CORRESPONDENCE and self.epoch:
+            self._find_centres()  # the loss moves the features away from them
         if self.epoch % options.validate_every == 0 or last:
             scores = self.validation.scores(self.network) if self.validation.scenes else {}
             entry = Epoch(self.epoch, self._rate(), loss, scores)
@@ -334,13 +371,19 @@ class Run:
         trunk = load_trunk(options.trunk, Path(options.weights) if options.weights else None)
         kind = {"kind": options.aggregation}
         clusters = {"clusters": options.clusters} if "netvlad" in options.aggregation else {}
-        return GlobalDescriptor(trunk, build_aggregation(trunk.channels, kind | clusters))
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(options.seed)  # hidden layers of an aggregation start at random
+            return GlobalDescriptor(trunk, build_aggregation(trunk.channels, kind | clusters))
 
     def _initialise(self) -> None:
         """Find NetVLAD's centres among local features of the training scenes (section 4.2)."""
         layer = self.network.network.aggregation
-        if self.options.start is not None or not isinstance(layer, NetVLAD):
-            return
+        if self.options.start is None and isinstance(layer, NetVLAD):
+            self._find_centres()
+
+    def _find_centres(self) -> None:
+        layer = self.network.network.aggregation
+        assert isinstance(layer, NetVLAD)
         drawn = _spread(self.real_scenes, limit=600, seed=self.options.seed)
         rng = np.random.default_rng([self.options.seed, 0])
         kept = []
@@ -377,12 +420,11 @@ class Run:
 
     def _optimizer(self) -> torch.optim.Adam:
         options = self.options
-        rates = self.network.network.aggregation.rates
         groups: dict[float, list[torch.nn.Parameter]] = {}
         for name, parameter in self.network.trained().items():
             factor = 1.0
             if not name.startswith("trunk."):
-                factor = options.head_rate * rates.get(name.removeprefix("aggregation."), 1.0)
+                factor = options.head_rate
             groups.setdefault(factor, []).append(parameter)
         return torch.optim.Adam(
             [{"params": group, "factor": factor} for factor, group in groups.items()],
