@@ -15,12 +15,13 @@ from colmap_netvlad.retrieval.ranking import Ranking
 if TYPE_CHECKING:
     from colmap_netvlad.retrieval.methods import RetrievalOptions
 
-DEEP_WEIGHT = 1.0
+DEEP_WEIGHT = 1.5
 VLAD_WEIGHT = 1.0
-"""Shares of the two rankings, chosen on the training flights (`scripts/fit_hybrid.py`)."""
+"""Shares of the two rankings, chosen on flights that the deep model was not trained on
+(`scripts/fit_hybrid.py`, docs/training-log.md)."""
 
 EXPANSION_NEIGHBOURS = 8
-EXPANSION_SHARE = 0.5
+EXPANSION_SHARE = 0.3
 """Query expansion, chosen with them."""
 
 LEAST_DEPTH = 200
