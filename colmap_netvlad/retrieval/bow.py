@@ -162,6 +162,9 @@ def _query(
         options = pycolmap.VocabTreePairingOptions()
         options.num_images = depth + 1  # COLMAP counts the image itself
         options.vocab_tree_path = tree
+        # In several threads pycolmap 4.2.1 answers one query in twenty differently from run to
+        # run, from the first partner on.
+        options.num_threads = 1
         start = time.perf_counter()
         with progress.step("Indexing with the vocabulary tree", 1) as bar:
             generator = pycolmap.VocabTreePairGenerator(options, database)
