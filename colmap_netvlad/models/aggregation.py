@@ -152,11 +152,10 @@ class AdaptedNetVLAD(NetVLAD):
 
     def local(self, features: Tensor) -> Tensor:
         """Features (B, D, N) to adapted ones (B, D, N), L2-normalised."""
-        with torch.autocast(features.device.type, enabled=False):
-            x = functional.normalize(features.float(), dim=1).transpose(1, 2)  # (B, N, D)
-            spread = self.spread.float()
-            adapted = x / spread + self.adapt((x - self.mean.float()) / spread)
-            return functional.normalize(adapted, dim=2).transpose(1, 2)
+        x = functional.normalize(features.float(), dim=1).transpose(1, 2)  # (B, N, D)
+        spread = self.spread.float()
+        adapted = x / spread + self.adapt((x - self.mean.float()) / spread)
+        return functional.normalize(adapted, dim=2).transpose(1, 2)
 
     def initialise(self, features: np.ndarray, seed: int = 0) -> float:
         """Start as `NetVLAD.initialise`, from adapted features; their mean and spread are kept."""

@@ -19,9 +19,10 @@ from torch import Tensor
 from torch.nn import functional
 
 from colmap_netvlad.models.aggregation import NetVLAD
-from colmap_netvlad.training.augment import Size, visible
+from colmap_netvlad.training.augment import Size
 from colmap_netvlad.training.sampling import Batch
 from colmap_netvlad.training.scenes import Scene
+from colmap_netvlad.training.visibility import points_in_views
 
 TOO_NEAR = 0.08
 """Places of one view nearer than this (of its longer side) are not told apart: about one cell of
@@ -59,22 +60,12 @@ def draw_correspondences(
         size: of the views.
         count: points drawn of each scene; each in two of the views that show it.
     """
-    for scene in sorted({scene for scene, _ in batch.samples}):
-        seen = scenes[scene].observations
-        if seen is None:
-            continue
-        points, rows, places = [], [], []
-        for row, (other, image) in enumerate(batch.samples):
-            if other != scene:
-                continue
-            point, at = seen.of(image)
-            inside, moved = visible(homographies[row], at, size)
-            points.append(point[inside])
-            rows.append(np.full(int(inside.sum()), row, np.intp))
-            places.append(moved[inside])
-        drawn = _two_of_each(np.concatenate(points), count, rng)
+    for views in points_in_views(batch, scenes, homographies, size):
+        drawn = _two_of_each(np.concatenate([view.points for view in views]), count, rng)
         if drawn.shape[1] > 1:
-            yield Correspondences(np.concatenate(rows)[drawn], np.concatenate(places)[drawn])
+            rows = np.repeat([view.row for view in views], [len(view.points) for view in views])
+            places = np.concatenate([view.at for view in views])
+            yield Correspondences(rows[drawn], places[drawn])
 
 
 def correspondence_loss(

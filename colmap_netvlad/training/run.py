@@ -222,18 +222,20 @@ class Run:
 
     def _loss(self, batch: Batch, drawn: Drawn) -> Tensor | None:
         """Return the loss of a batch; None where its views have nothing in common."""
+        rng = np.random.default_rng([self.options.seed, 2, self.epoch, self.number])
+        if self.options.loss == CORRESPONDENCE:
+            return self._correspondence_loss(batch, drawn, rng)
+        return self._descriptor_loss(batch, drawn, rng)
+
+    def _descriptor_loss(
+        self, batch: Batch, drawn: Drawn, rng: np.random.Generator
+    ) -> Tensor | None:
         options = self.options
-        with torch.autocast("cuda", torch.bfloat16, enabled=self.device.type == "cuda"):
+        batch = by_views(batch, self.scenes, drawn.homographies, self.photos.size, options.epsilon)
+        if not batch.queries:
+            return None
+        with self._mixed_precision():
             front = self.inputs.front(self.network, drawn.inputs.to(self.device))
-            if options.loss == CORRESPONDENCE:
-                features = self.network.features(front)
-                return self._correspondence_loss(batch, drawn, features.float())
-            batch = by_views(
-                batch, self.scenes, drawn.homographies, self.photos.size, options.epsilon
-            )
-            if not batch.queries:
-                return None
-            rng = np.random.default_rng([options.seed, 2, self.epoch, self.number])
             descriptors = self.network.rest(front, options.keep_local, rng).float()
         loss = LOSSES[options.loss](descriptors, batch.queries, options.for_losses())
         if self.teacher is not None:
@@ -241,25 +243,31 @@ class Run:
             loss = loss + options.teacher_weight * keep_similarities(descriptors, wanted)
         return loss
 
-    def _correspondence_loss(self, batch: Batch, drawn: Drawn, features: Tensor) -> Tensor | None:
+    def _correspondence_loss(
+        self, batch: Batch, drawn: Drawn, rng: np.random.Generator
+    ) -> Tensor | None:
         """Return the mean over the scenes of a batch."""
         options, size = self.options, self.photos.size
         layer = self.network.network.aggregation
         assert isinstance(layer, NetVLAD)  # TrainOptions has seen to it
-        rng = np.random.default_rng([options.seed, 2, self.epoch, self.number])
+        with self._mixed_precision():
+            front = self.inputs.front(self.network, drawn.inputs.to(self.device))
+            features = self.network.features(front).float()
+        spread = functional.normalize(features.detach(), dim=1).std(dim=(0, 2, 3)).mean()
         losses = []
         for found in draw_correspondences(
             batch, self.scenes, drawn.homographies, size, options.points, rng
         ):
-            spread = functional.normalize(features.detach(), dim=1).std(dim=(0, 2, 3)).mean()
-            noise = torch.from_numpy(
-                rng.standard_normal((2 * len(found), features.shape[1]), np.float32)
-            )
-            noise = options.noise * spread * noise.to(self.device)
+            drawn_noise = rng.standard_normal((2 * len(found), features.shape[1]), np.float32)
+            noise = options.noise * spread * torch.from_numpy(drawn_noise).to(self.device)
             losses.append(
                 correspondence_loss(features, found, layer, size, options.temperature, noise)
             )
         return torch.stack(losses).mean() if losses else None
+
+    def _mixed_precision(self) -> torch.autocast:
+        """The network's precision on a GPU; losses are computed outside it, in float32."""
+        return torch.autocast("cuda", torch.bfloat16, enabled=self.device.type == "cuda")
 
     def _nan_sentence(self, batch: Batch) -> str:
         photos = ", ".join(

@@ -6,7 +6,8 @@ is counted anew over the points that both views show.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,22 +51,47 @@ def by_views(
     return Batch(batch.samples, tuple(queries))
 
 
+@dataclass(frozen=True, eq=False)
+class ViewPoints:
+    """The 3D points that a view of a batch shows.
+
+    Attributes:
+        row: of the view in the batch.
+        points: (m,) indices of the points in its scene.
+        at: (m, 2) where in the view: origin in the centre, unit the longer side.
+    """
+
+    row: int
+    points: NDArray[np.int32]
+    at: NDArray[np.float64]
+
+
+def points_in_views(
+    batch: Batch, scenes: Sequence[Scene], homographies: NDArray[np.float64], size: Size
+) -> Iterator[list[ViewPoints]]:
+    """Yield what the views of each scene show, scene by scene; without scenes of unknown points."""
+    for scene in sorted({scene for scene, _ in batch.samples}):
+        seen = scenes[scene].observations
+        if seen is None:
+            continue
+        views = []
+        for row, (other, image) in enumerate(batch.samples):
+            if other == scene:
+                points, at = seen.of(image)
+                inside, moved = visible(homographies[row], at, size)
+                views.append(ViewPoints(row, points[inside], moved[inside]))
+        yield views
+
+
 def _similarity(
     batch: Batch, scenes: Sequence[Scene], homographies: NDArray[np.float64], size: Size
 ) -> NDArray[np.int32]:
     """Return (N, N) the number of 3D points that the views of two samples share."""
     similarity = np.zeros((len(batch.samples),) * 2, np.int32)
-    for scene in {scene for scene, _ in batch.samples}:
-        seen = scenes[scene].observations
-        if seen is None:
-            continue
-        rows = [row for row, (other, _) in enumerate(batch.samples) if other == scene]
-        shown = []
-        for row in rows:
-            points, at = seen.of(batch.samples[row][1])
-            shown.append(points[visible(homographies[row], at, size)[0]])
-        first = np.cumsum([0, *map(len, shown)])
-        points = np.concatenate(shown)
+    for views in points_in_views(batch, scenes, homographies, size):
+        rows = [view.row for view in views]
+        first = np.cumsum([0, *(len(view.points) for view in views)])
+        points = np.concatenate([view.points for view in views])
         part = Observations(first, points, np.zeros((len(points), 2), np.float32))
         table = common_points(part, int(points.max(initial=0)) + 1).toarray()
         similarity[np.ix_(rows, rows)] = table
