@@ -35,7 +35,7 @@ from colmap_netvlad.models.catalogue import DEFAULT
 from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval.fusion import similarity_matrix
 from colmap_netvlad.retrieval.methods import RetrievalOptions, rank
-from colmap_netvlad.rounds import IndexPair, find_candidates, replay, take_turns
+from colmap_netvlad.rounds import FITTED, IndexPair, find_candidates, replay, take_turns
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 from fit_rounds import read_scene, truth_of
@@ -114,7 +114,8 @@ def measure(project: Project, k: int, vocab_tree: Path | None) -> None:
                 left.first, left.second, left.evidence[:, 0], names, budget
             )
         else:
-            *_, tested = replay(similarity, truth, names, budget, rounds)
+            weights = FITTED[rankings[method, gps].compared]
+            *_, tested = replay(similarity, truth, names, budget, rounds, weights)
             chosen = list(tested)
         correct = sum(truth.get(pair, 0) > CORRECT_MATCHES for pair in chosen)
         pairs = [(names[i], names[j]) for i, j in chosen]

@@ -24,7 +24,7 @@ from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval.fusion import similarity_matrix
 from colmap_netvlad.retrieval.methods import RetrievalOptions, rank
 from colmap_netvlad.retrieval.ranking import NO_PARTNER, Ranking
-from colmap_netvlad.rounds import IndexPair, replay
+from colmap_netvlad.rounds import FITTED, IndexPair, replay
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 from fit_rounds import read_scene, truth_of
@@ -47,9 +47,10 @@ def correct(pairs: set[IndexPair], truth: dict[IndexPair, int]) -> int:
 
 
 def spend(
-    similarity: sparse.csr_array, truth: dict[IndexPair, int], names: tuple[str, ...], budget: int
+    similarity: sparse.csr_array, ranking: Ranking, truth: dict[IndexPair, int], budget: int
 ) -> set[IndexPair]:
-    *_, last = replay(similarity, truth, names, budget, ROUNDS)
+    weights = FITTED[ranking.compared]
+    *_, last = replay(similarity, truth, ranking.names, budget, ROUNDS, weights)
     return set(last)
 
 
@@ -67,13 +68,13 @@ def table(project: Project, methods: list[str], ks: list[int], options: Retrieva
         for k in ks:
             chosen = one_round(ranking, k)
             hits = correct(chosen, truth)
-            rounds = spend(similarity, truth, names, len(chosen))
+            rounds = spend(similarity, ranking, truth, len(chosen))
             hits_of_rounds = correct(rounds, truth)
             share = next(
                 (
                     f"{share:.0%}"
                     for share in SHARES
-                    if correct(spend(similarity, truth, names, int(share * len(chosen))), truth)
+                    if correct(spend(similarity, ranking, truth, int(share * len(chosen))), truth)
                     >= hits
                 ),
                 "more",

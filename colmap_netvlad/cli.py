@@ -81,6 +81,14 @@ gps_option = click.option(
     help="Whether positions (priors or EXIF) re-weight the candidates.  [default: auto for hybrid,"
     " off for the methods of the literature]",
 )
+rerank_option = click.option(
+    "--rerank",
+    type=click.IntRange(min=0),
+    default=100,
+    show_default=True,
+    help="Candidates of each image that deep methods compare place by place; 0: none, the global"
+    " descriptors alone as in the paper.",
+)
 copy_option = click.option(
     "--copy",
     is_flag=True,
@@ -478,6 +486,7 @@ def quoted(path: Path) -> str:
 )
 @click.option("--vocab-tree", type=FILE, help="Vocabulary tree of the method bow.")
 @gps_option
+@rerank_option
 @click.option(
     "--other-cameras",
     type=float,
@@ -520,6 +529,7 @@ def pairs(
     exact: bool | None,
     vocab_tree: Path | None,
     gps: str | None,
+    rerank: int,
     other_cameras: float,
     sequential: int,
     own_pairs: Path | None,
@@ -550,6 +560,7 @@ def pairs(
         exact=exact,
         masks=masks,
         gps=gps,
+        rerank=rerank,
     )
     rules = PartnerRules(other_cameras, sequential, own_pairs)
     report = make_pairs(project, method or DEFAULT, options, format, output, rules, connect)
@@ -649,6 +660,7 @@ def demo(output: Path, method: str | None, seed: int) -> None:
     "--reconstruct-k", type=int, help="Which of --k the models are made from.  [default: largest]"
 )
 @click.option("--vocab-tree", type=FILE, help="Vocabulary tree of the method bow.")
+@rerank_option
 @click.option("--yes", is_flag=True, help="Do not ask before a long exhaustive matching.")
 @cache_option
 @device_option
@@ -663,6 +675,7 @@ def compare(
     build: bool,
     reconstruct_k: int | None,
     vocab_tree: Path | None,
+    rerank: int,
     yes: bool,
     cache: Path | None,
     device: str | None,
@@ -690,7 +703,7 @@ def compare(
         output=output,
         reconstruct=build,
         reconstruct_k=reconstruct_k,
-        retrieval=RetrievalOptions(device=device, vocab_tree=vocab_tree),
+        retrieval=RetrievalOptions(device=device, vocab_tree=vocab_tree, rerank=rerank),
         seed=seed,
     )
     names = [name.strip() for name in methods.split(",") if name.strip()]

@@ -28,6 +28,7 @@ from colmap_netvlad.images import (
     find_photos,
     read_header,
 )
+from colmap_netvlad.machine import usable_processors
 
 CHUNK_PHOTOS = 8
 """Photos of one chunk for each thread; the bar moves once a chunk."""
@@ -185,7 +186,7 @@ def _read_headers(
 
     headers: dict[str, PhotoHeader] = {}
     bad: list[tuple[str, str]] = []
-    pool = ThreadPoolExecutor(engine.usable_processors())
+    pool = ThreadPoolExecutor(usable_processors())
     try:
         with progress.step("Checking photos", len(names)) as bar:
             for name, header in zip(names, pool.map(read, names), strict=True):
@@ -299,7 +300,7 @@ def _threads(options: FeatureOptions) -> int:
     """As many threads as processors, unless SIFT's scale space would fill half the memory."""
     if options.threads is not None:
         return options.threads
-    processors = engine.usable_processors()
+    processors = usable_processors()
     try:
         memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     except (AttributeError, ValueError, OSError):

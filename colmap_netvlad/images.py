@@ -21,6 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
+from colmap_netvlad.machine import usable_processors
+
 PHOTO_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"})
 """What counts as a photo in a folder; other files (raw, video, logs) are passed over."""
 
@@ -152,9 +154,11 @@ def decode_photo(path: Path, long_side: int) -> NDArray[np.uint8]:
     if pixels is None:
         raise BadPhoto("cannot be decoded (damaged, or a kind of file OpenCV does not read)")
     height, width = pixels.shape[:2]
-    scale = long_side / max(height, width)
-    size = (_rounded(width * scale), _rounded(height * scale))
-    smooth = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
+    # The header's aspect ratio: sides of a photo decoded at a fraction of its size are rounded up.
+    ratio = min(header.width, header.height) / max(header.width, header.height)
+    longer, shorter = _rounded(long_side), _rounded(long_side * ratio)
+    size = (longer, shorter) if width >= height else (shorter, longer)
+    smooth = cv2.INTER_AREA if long_side < max(height, width) else cv2.INTER_LINEAR
     resized = cv2.resize(pixels, size, interpolation=smooth)
     return np.asarray(cv2.cvtColor(resized, cv2.COLOR_BGR2RGB), np.uint8)
 
@@ -215,7 +219,7 @@ def load_batches(
         mask = find_mask(masks, name) if masks is not None else None
         return pixels if mask is None else neutralise(pixels, mask)
 
-    workers = workers or os.cpu_count() or 1
+    workers = workers or usable_processors()
     waiting: dict[tuple[int, ...], list[tuple[str, NDArray[np.uint8]]]] = defaultdict(list)
     bad: list[tuple[str, str]] = []
     queue: deque[tuple[str, Future[NDArray[np.uint8]]]] = deque()

@@ -24,7 +24,7 @@ from colmap_netvlad.retrieval.hybrid import fusion_depth
 from colmap_netvlad.retrieval.methods import RetrievalOptions, rank
 from colmap_netvlad.retrieval.ranking import Ranking
 from colmap_netvlad.retrieval.store import Store
-from colmap_netvlad.rounds import IndexPair, next_round, split_budget
+from colmap_netvlad.rounds import FITTED, IndexPair, next_round, split_budget
 
 PLAN_SETTING = "rounds"
 """Where the cache keeps the rounds chosen so far."""
@@ -215,7 +215,9 @@ class _Run:
     def _round(self, number: int, room: int, similarity: sparse.csr_array) -> RoundReport:
         start = time.perf_counter()
         if number == len(self.plan.rounds):
-            chosen = next_round(similarity, self._verified(), self.ranking.names, room)
+            weights = FITTED[self.ranking.compared]
+            names, verified = self.ranking.names, self._verified()
+            chosen = next_round(similarity, verified, names, room, weights)
             self.plan.rounds.append(chosen)
             self.plan.save()
         seconds = time.perf_counter() - start

@@ -27,6 +27,7 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 from colmap_netvlad import engine, progress, workers
 from colmap_netvlad.database import open_database, pair_id
 from colmap_netvlad.errors import InputError
+from colmap_netvlad.machine import usable_processors
 
 FIRST_CHUNK = 32
 """Pairs of the first chunk; the next ones are sized to take `CHUNK_SECONDS`."""
@@ -147,7 +148,7 @@ def _in_tiles(pairs: Sequence[IdPair]) -> list[IdPair]:
 def _match_all(
     database: Path, pairs: Sequence[IdPair], options: MatchOptions, advance: Callable[[int], None]
 ) -> None:
-    most = 1 if pycolmap.has_cuda else options.processes or engine.usable_processors()
+    most = 1 if pycolmap.has_cuda else options.processes or usable_processors()
     count = max(1, min(most, len(pairs) // WORTH_A_PROCESS))
     blocks = [pairs[at : at + BLOCK] for at in range(0, len(pairs), BLOCK)]
     with tempfile.TemporaryDirectory(prefix="colmap-netvlad-") as folder:

@@ -48,14 +48,25 @@ class Weights:
     intercept: float
 
 
-FITTED = Weights(
-    similarity=0.162,
-    agreeing=1.28,
-    failing=-3.84,
-    rate=-0.39,
-    support=0.482,
-    intercept=-2.08,
-)
+FITTED = {
+    False: Weights(
+        similarity=0.162,
+        agreeing=1.28,
+        failing=-3.84,
+        rate=-0.39,
+        support=0.482,
+        intercept=-2.08,
+    ),
+    True: Weights(
+        similarity=1.84,
+        agreeing=1.43,
+        failing=-5.53,
+        rate=-3.08,
+        support=0.816,
+        intercept=-7.39,
+    ),
+}
+"""By whether the ranking's candidates were compared place by place: such a ranking says more."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +82,7 @@ class Candidates:
     second: NDArray[np.int64]
     evidence: NDArray[np.float64]
 
-    def probability(self, weights: Weights = FITTED) -> NDArray[np.float64]:
+    def probability(self, weights: Weights = FITTED[False]) -> NDArray[np.float64]:
         """Return (M,) the probability that each pair verifies, 0..1."""
         *slopes, intercept = astuple(weights)
         logit = self.evidence @ np.array(slopes) + intercept
@@ -148,7 +159,7 @@ def next_round(
     verified: Mapping[IndexPair, int],
     names: Sequence[str],
     budget: int,
-    weights: Weights = FITTED,
+    weights: Weights = FITTED[False],
 ) -> list[IndexPair]:
     """Return at most `budget` untested pairs to match next, the most valuable first.
 
@@ -182,7 +193,7 @@ def replay(
     names: Sequence[str],
     budget: int,
     rounds: int,
-    weights: Weights = FITTED,
+    weights: Weights = FITTED[False],
 ) -> Iterator[dict[IndexPair, int]]:
     """Play rounds on a flight whose every pair is matched already; nothing is matched.
 

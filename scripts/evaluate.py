@@ -13,6 +13,8 @@ from pathlib import Path
 
 import click
 
+from colmap_netvlad.retrieval.methods import RetrievalOptions
+from colmap_netvlad.retrieval.rerank import DEPTH
 from colmap_netvlad.training.evaluate import evaluate, markdown
 from colmap_netvlad.training.scenes import load_dataset
 
@@ -21,8 +23,12 @@ from colmap_netvlad.training.scenes import load_dataset
 @click.argument("datasets", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option("--databases", required=True, type=click.Path(path_type=Path))
 @click.option("--method", "methods", multiple=True, default=["bow", "vlad"], show_default=True)
-def main(datasets: tuple[Path, ...], databases: Path, methods: tuple[str, ...]) -> None:
-    click.echo(markdown(evaluate(methods, load_dataset(datasets), databases)), nl=False)
+@click.option("--rerank", default=DEPTH, show_default=True, help="As in `pairs`.")
+def main(
+    datasets: tuple[Path, ...], databases: Path, methods: tuple[str, ...], rerank: int
+) -> None:
+    options = RetrievalOptions(rerank=rerank)
+    click.echo(markdown(evaluate(methods, load_dataset(datasets), databases, options)), nl=False)
 
 
 if __name__ == "__main__":

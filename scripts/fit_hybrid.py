@@ -81,7 +81,7 @@ def main() -> None:
 
 
 def _both(project: Project, model: str) -> list[Ranking]:
-    options = RetrievalOptions(k=len(image_names(project.database)) - 1, gps="off")
+    options = RetrievalOptions(k=len(image_names(project.database)) - 1, gps="off", rerank=0)
     return [rank(project, model, options), rank(project, "vlad", options)]
 
 

@@ -54,10 +54,11 @@ def examples(
     depth = min(fusion_depth(20), len(names) - 1)
     ranking = rank(project, method, replace(options, k=depth))
     similarity, truth = similarity_matrix(ranking), truth_of(project)
+    weights = FITTED[ranking.compared]
     evidence, labels = [], []
     for budget in BUDGETS:
         for rounds in ROUNDS:
-            played = replay(similarity, truth, names, budget * len(names), rounds, FITTED)
+            played = replay(similarity, truth, names, budget * len(names), rounds, weights)
             for tested in list(played)[:-1]:
                 left = find_candidates(similarity, tested)
                 evidence.append(left.evidence)
@@ -95,7 +96,7 @@ def main() -> None:
         evidence, labels = data[-1]
         print(f"{project.database.stem}: {len(evidence):,} examples, {labels.mean():.0%} verify")
     weights = fit(data)
-    print("FITTED = Weights(")
+    print("Weights(")
     for field in fields(Weights):
         print(f"    {field.name}={getattr(weights, field.name):.3g},")
     print(")")

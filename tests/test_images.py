@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from photos import BROKEN, HEIGHT, SOUND, WIDTH, save_jpeg, scene
 
@@ -100,6 +100,7 @@ def test_reduced_decoding_keeps_the_picture(long_side: int, reduced: int, tmp_pa
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=40)
 @given(width=st.integers(16, 300), height=st.integers(16, 300), long_side=st.integers(16, 320))
+@example(width=272, height=217, long_side=30)  # decoded at an eighth: 34 x 28, rounded up
 def test_sides_are_multiples_and_the_aspect_ratio_is_kept(
     width: int, height: int, long_side: int, tmp_path: Path
 ) -> None:

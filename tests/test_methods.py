@@ -153,16 +153,16 @@ def test_a_killed_description_goes_on_where_it_stopped(
     from colmap_netvlad.models.describe import DescriptorModel
 
     project = project_copy()
-    describe, calls = DescriptorModel.describe, []
+    describe, calls = DescriptorModel.describe_with_local, []
 
-    def describe_twice(self: DescriptorModel, pixels: np.ndarray) -> np.ndarray:
+    def describe_twice(self: DescriptorModel, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         calls.append(len(pixels))
         if len(calls) == 3:
             raise KeyboardInterrupt
         return describe(self, pixels)
 
     with monkeypatch.context() as patch:
-        patch.setattr(DescriptorModel, "describe", describe_twice)
+        patch.setattr(DescriptorModel, "describe_with_local", describe_twice)
         with pytest.raises(KeyboardInterrupt):
             rank(project, checkpoint, RetrievalOptions(k=4, batch_size=2))
     ranking = rank(project, checkpoint, RetrievalOptions(k=4, batch_size=2))

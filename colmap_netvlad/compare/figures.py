@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import networkx as nx
 import pycolmap
 
-from colmap_netvlad import __version__, engine, metrics
+from colmap_netvlad import __version__, metrics
 from colmap_netvlad.compare import pool
 from colmap_netvlad.compare.evidence import Evidence
 from colmap_netvlad.compare.finds import single_finds
@@ -24,6 +24,7 @@ from colmap_netvlad.compare.result import (
     RetrievalFigures,
 )
 from colmap_netvlad.compare.workspace import ProjectFacts, Workspace
+from colmap_netvlad.machine import usable_processors
 from colmap_netvlad.metrics import Pair
 from colmap_netvlad.positions import read_positions
 from colmap_netvlad.project import Project
@@ -176,7 +177,7 @@ def _versions() -> dict[str, str]:
     return {
         "colmap-netvlad": __version__,
         "pycolmap": pycolmap.__version__,
-        "Processor": f"{platform.machine()}, {engine.usable_processors()} cores",
+        "Processor": f"{platform.machine()}, {usable_processors()} cores",
     }
 
 

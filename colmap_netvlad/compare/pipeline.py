@@ -235,6 +235,7 @@ def _ranking_key(text: str, options: RetrievalOptions) -> str:
         key += f"-{options.vocab_tree.resolve()}-{options.vocab_tree.stat().st_mtime_ns}"
     if method.model is not None:
         key += f"-{deep.model_fingerprint(deep.checkpoint_file(method.model))}"
+        key += f"-rerank{options.rerank}"
     return key
 
 

@@ -20,9 +20,9 @@ from pathlib import Path
 import pycolmap
 
 from colmap_netvlad import progress, workers
-from colmap_netvlad.engine import usable_processors
 from colmap_netvlad.errors import InputError
 from colmap_netvlad.files import write_atomically
+from colmap_netvlad.machine import usable_processors
 from colmap_netvlad.mapping.incremental import pipeline_options
 from colmap_netvlad.mapping.merge import merge, read_sub_model
 from colmap_netvlad.mapping.options import MappingOptions

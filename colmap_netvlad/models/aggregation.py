@@ -33,6 +33,14 @@ class Aggregation(nn.Module):
         """What a checkpoint needs to build the layer again, beside the channels."""
         return {"kind": self.kind}
 
+    def local(self, features: Tensor) -> Tensor:
+        """Features (B, D, N) to what is compared place by place: the same, L2-normalised."""
+        return functional.normalize(features.float(), dim=1)
+
+    def with_local(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Features (B, D, h, w) to vectors (B, dim) and local features (B, D, h w)."""
+        return self(features), self.local(features.flatten(2))
+
 
 class NetVLAD(Aggregation):
     """NetVLAD (eq. 14 and 16) with b_k = 0, intra-normalisation and L2 normalisation.
@@ -57,12 +65,12 @@ class NetVLAD(Aggregation):
         """See `Aggregation`."""
         return {"kind": self.kind, "clusters": self.clusters}
 
-    def local(self, features: Tensor) -> Tensor:
-        """Features (B, D, N) to what is assigned and summed: the same, L2-normalised."""
-        return functional.normalize(features.float(), dim=1)
-
     def forward(self, features: Tensor) -> Tensor:
         """Features (B, D, h, w) to descriptors (B, K D), cluster by cluster."""
+        return self.with_local(features)[0]
+
+    def with_local(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """See `Aggregation`; what is assigned and summed are the local features."""
         # Float32 throughout, whatever the trunk's precision: it is little work, and sums over
         # a thousand features do not survive half precision.
         with torch.autocast(features.device.type, enabled=False):
@@ -72,7 +80,7 @@ class NetVLAD(Aggregation):
             mass = assigned.sum(dim=2, keepdim=True)  # (B, K, 1)
             residuals = assigned @ x.transpose(1, 2) - mass * self.centres.float()  # (B, K, D)
             residuals = functional.normalize(residuals, dim=2)
-            return functional.normalize(residuals.flatten(1), dim=1)
+            return functional.normalize(residuals.flatten(1), dim=1), x
 
     @torch.no_grad()
     def init_from_centres(self, centres: Tensor, alpha: float) -> None:

@@ -101,7 +101,6 @@ class DescriptorModel:
         self._network = copy.deepcopy(network).eval().requires_grad_(False).to(self.device)
         self._network.trunk = prepare_trunk(network.trunk, self.device, self.precision)
 
-    @torch.inference_mode()
     def describe(self, pixels: np.ndarray) -> np.ndarray:
         """Describe photos of one size.
 
@@ -111,29 +110,67 @@ class DescriptorModel:
         Returns:
             descriptors: float32 (B, dim), L2-normalised.
         """
+        return self.describe_with_local(pixels)[0]
+
+    @torch.inference_mode()
+    def describe_with_local(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Describe photos of one size, as a whole and place by place.
+
+        Args:
+            pixels: uint8 (B, 3, H, W), RGB.
+
+        Returns:
+            descriptors: float32 (B, dim), L2-normalised.
+            local features: float32 (B, C, h, w), L2-normalised, the mean over the turns of each
+            place; zero where the photo has no texture (a mask, a black corner), which would look
+            the same in photos that share nothing.
+        """
         if len(pixels) == 0:
-            return np.zeros((0, self.dim), np.float32)
+            return np.zeros((0, self.dim), np.float32), np.zeros((0, 0, 0, 0), np.float32)
         photos = torch.from_numpy(np.ascontiguousarray(pixels))
         # One photo at a time on a processor: as fast as a batch there, and a descriptor does not
         # depend on which photos happened to be described with it.
         size = 1 if self.device.type == "cpu" else len(photos)
         parts = [self._describe(batch) for batch in photos.split(size)]
-        return torch.cat(parts).cpu().numpy()
+        descriptors, local = (torch.cat(part).cpu().numpy() for part in zip(*parts, strict=True))
+        return descriptors, local
 
-    def _describe(self, photos: Tensor) -> Tensor:
+    def _describe(self, photos: Tensor) -> tuple[Tensor, Tensor]:
         photos = photos.to(self.device)
         turned = [torch.rot90(photos, turns, dims=(2, 3)) for turns in range(self.rotations)]
         # Opposite rotations have the same size: two passes for four rotations.
-        passes = [torch.cat(turned[first::2]) for first in range(min(2, self.rotations))]
-        descriptors = torch.cat([self._run(batch) for batch in passes])
+        step = min(2, self.rotations)
+        passes = [self._run(torch.cat(turned[first::step])) for first in range(step)]
+        descriptors = torch.cat([vectors for vectors, _ in passes])
         mean = descriptors.view(self.rotations, len(photos), -1).mean(dim=0)
-        return functional.normalize(mean, dim=1)
+        upright = [
+            torch.rot90(local, -(first + step * place), dims=(2, 3))
+            for first, (_, both) in enumerate(passes)
+            for place, local in enumerate(both.split(len(photos)))
+        ]
+        local = functional.normalize(torch.stack(upright).mean(dim=0), dim=1)
+        return functional.normalize(mean, dim=1), local * has_texture(photos, local.shape[2:])
 
-    def _run(self, pixels: Tensor) -> Tensor:
+    def _run(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
         network = self._network
         # Normalised in float32, then rounded: 0..255 minus a mean loses little that way.
         normal = pixels.to(torch.float32, memory_format=torch.channels_last)
         with torch.autocast(
             self.device.type, self.precision, enabled=self.precision != torch.float32
         ):
-            return network(normal).float()
+            descriptors, local = network.with_local(normal)
+            return descriptors.float(), local.float()
+
+
+def has_texture(photos: Tensor, grid: torch.Size) -> Tensor:
+    """Return float (B, 1, h, w): 0 where a cell of the grid or one beside it is a single colour.
+
+    Args:
+        photos: uint8 (B, 3, H, W).
+        grid: (h, w).
+    """
+    pixels = photos.float()
+    brightest = functional.adaptive_max_pool2d(pixels, grid)
+    darkest = -functional.adaptive_max_pool2d(-pixels, grid)
+    even = (brightest == darkest).all(dim=1, keepdim=True).float()
+    return 1 - functional.max_pool2d(even, 3, stride=1, padding=1)

@@ -40,5 +40,15 @@ class GlobalDescriptor(nn.Module):
 
     def forward(self, pixels: Tensor) -> Tensor:
         """RGB pixels of 0..255, float (B, 3, H, W), to descriptors (B, D), L2-normalised."""
-        descriptors = self.aggregation(self.features(pixels))
-        return descriptors if self.whitening is None else self.whitening(descriptors)
+        return self.with_local(pixels)[0]
+
+    def with_local(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
+        """RGB pixels as for `forward` to descriptors (B, D) and local features (B, C, h, w).
+
+        Both are L2-normalised.
+        """
+        features = self.features(pixels)
+        descriptors, local = self.aggregation.with_local(features)
+        if self.whitening is not None:
+            descriptors = self.whitening(descriptors)
+        return descriptors, local.unflatten(2, features.shape[2:])

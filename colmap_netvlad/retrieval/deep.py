@@ -16,6 +16,7 @@ from colmap_netvlad.models.catalogue import CATALOGUE
 from colmap_netvlad.progress import step
 from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval.described import cache_note, missing, rank_described
+from colmap_netvlad.retrieval.local import LocalFeatures
 from colmap_netvlad.retrieval.ranking import Ranking
 from colmap_netvlad.retrieval.store import Store
 
@@ -28,12 +29,13 @@ BATCH_SIZE = 8
 def rank(project: Project, name_or_path: str | Path, options: RetrievalOptions) -> Ranking:
     """Rank by a model's descriptors; photos already described are not described again.
 
+    Local features for `retrieval.rerank` are kept with them where `options.rerank` is not 0.
     Photos that cannot be used are left out: they have no partners and are listed with a reason.
 
     Args:
         project: its photo folder must be known.
         name_or_path: a model of the catalogue, or a checkpoint file.
-        options: k, device, batch size, exact, seed.
+        options: k, rerank, device, batch size, exact, seed.
 
     Raises:
         InputError: no photo folder, no weights, not a checkpoint, or no photo that can be used.
@@ -44,7 +46,7 @@ def rank(project: Project, name_or_path: str | Path, options: RetrievalOptions) 
     with Store(project.cache) as store:
         photos, left_out = fingerprints(folder, names, options.masks)
         model = model_fingerprint(checkpoint)
-        to_do = missing(store, model, photos)
+        to_do = missing(store, model, photos, local=options.rerank > 0)
         bad = _describe(store, model, checkpoint, folder, to_do, photos, options)
         left_out |= bad
         if len(left_out) == len(names):
@@ -132,11 +134,11 @@ def _describe(
         for batch in batches:
             bad |= dict(batch.bad)
             if batch.names:
-                vectors = network.describe(batch.pixels)
+                vectors, maps = network.describe_with_local(batch.pixels)
+                local = [LocalFeatures.of(features) for features in maps] if options.rerank else []
                 done = time.perf_counter()
-                store.add_descriptors(
-                    model, batch.names, [photos[n] for n in batch.names], vectors, done - start
-                )
+                contents = [photos[name] for name in batch.names]
+                store.add_descriptors(model, batch.names, contents, vectors, done - start, local)
                 # Waiting for the decoders belongs to the next batch's time.
                 start = done
             bar.advance(len(batch.names) + len(batch.bad))

@@ -16,11 +16,13 @@ if TYPE_CHECKING:
     from colmap_netvlad.retrieval.methods import RetrievalOptions
 
 
-def missing(store: Store, model: str, photos: Mapping[str, str]) -> list[str]:
+def missing(store: Store, model: str, photos: Mapping[str, str], local: bool = False) -> list[str]:
     """Return the names in `photos` (name -> fingerprint) that the model has not described yet,
-    or described from another content."""
-    known = store.described(model)
-    return [name for name, photo in photos.items() if known.get(name) != photo]
+    or described from another content; with `local`, also those without local features."""
+    known = set(store.described(model).items())
+    if local:
+        known &= set(store.described_locally(model).items())
+    return [name for name, photo in photos.items() if (name, photo) not in known]
 
 
 def cache_note(computed: int, total: int) -> str:

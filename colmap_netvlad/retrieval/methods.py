@@ -17,6 +17,8 @@ from colmap_netvlad.retrieval import baselines, bow, deep, hybrid, spatial, vlad
 from colmap_netvlad.retrieval.gps import near_first
 from colmap_netvlad.retrieval.hybrid import fusion_depth
 from colmap_netvlad.retrieval.ranking import Ranking
+from colmap_netvlad.retrieval.rerank import DEPTH, rerank
+from colmap_netvlad.retrieval.store import Store
 
 CHECKPOINT_SUFFIXES = (".safetensors", ".mat")
 
@@ -36,6 +38,8 @@ class RetrievalOptions:
         masks: folder of masks in COLMAP's way: masked areas are neutral to deep descriptors.
         gps: whether positions re-weight the candidates, one of `GPS_MODES`; None: "auto" for
             methods that are not from the literature, else "off".
+        rerank: candidates of each image that deep methods compare place by place
+            (`retrieval.rerank`); 0: none, the global descriptors alone.
     """
 
     k: int = 30
@@ -47,6 +51,7 @@ class RetrievalOptions:
     exact: bool | None = None
     masks: Path | None = None
     gps: str | None = None
+    rerank: int = DEPTH
 
 
 GPS_MODES = ("auto", "off", "require")
@@ -61,7 +66,8 @@ class Method:
         name: what users call it.
         summary: one line with its source.
         needs: of "photos", "features", "positions".
-        rank: ranks the images of a project by appearance (or, for `spatial`, by position).
+        rank: ranks the images of a project by appearance (or, for `spatial`, by position). Where
+            there is a `model` these are candidates, which are compared place by place then.
         gps: whether positions join in by themselves.
         model: the deep model it runs: a name of the catalogue or a checkpoint file.
     """
@@ -99,8 +105,8 @@ METHODS: dict[str, Method] = {
         ),
         Method(
             "hybrid",
-            "The default deep model, VLAD and, where there is any, GPS added up, with query"
-            " expansion: ours.",
+            "Candidates of the default deep model, VLAD and, where there is any, GPS, compared"
+            " place by place: ours.",
             frozenset({"photos", "features"}),
             hybrid.rank,
             gps=True,
@@ -151,16 +157,24 @@ def rank(project: Project, name: str | Path, options: RetrievalOptions | None = 
             is not there.
     """
     options = options or RetrievalOptions()
+    if options.rerank < 0:
+        raise InputError(f"--rerank is {options.rerank}; it is a number of candidates, 0 for none.")
     # `hybrid` is told its deep model by --model; for the others a model is the method.
     method = find_method(name if str(name) == "hybrid" else options.model or name)
     count = len(image_names(project.database))
     k = check_k(options.k, count)
+    compared = min(options.rerank, count - 1) if method.model else 0
+    depth = max(k, compared)
     positions = _positions(project, method, options)
     if positions is None:
-        ranking = method.rank(project, replace(options, k=k))
+        ranking = method.rank(project, replace(options, k=depth))
     else:
-        deep_enough = replace(options, k=fusion_depth(k))
-        ranking = near_first(method.rank(project, deep_enough), positions, k)
+        deeper = method.rank(project, replace(options, k=fusion_depth(depth)))
+        ranking = near_first(deeper, positions, depth)
+    if compared:
+        model = deep.model_fingerprint(deep.checkpoint_file(options.model or method.model or ""))
+        with Store(project.cache) as store:
+            ranking = rerank(ranking, store, model, k, compared)
     if k < options.k:
         note = f"k lowered from {options.k} to {k}: the project has {count} images"
         ranking = replace(ranking, notes=(*ranking.notes, note))

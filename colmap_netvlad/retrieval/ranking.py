@@ -27,6 +27,7 @@ class Ranking:
         notes: sentences for the report (which vocabulary tree, what came from the cache).
         left_out: (image name, reason) of images that could not be described; their rows are
             empty.
+        compared: whether its candidates were compared place by place (`retrieval.rerank`).
     """
 
     names: tuple[str, ...]
@@ -37,6 +38,7 @@ class Ranking:
     seconds_search: float = 0.0
     notes: tuple[str, ...] = field(default=())
     left_out: tuple[tuple[str, str], ...] = field(default=())
+    compared: bool = False
 
     def __post_init__(self) -> None:
         shape = (len(self.names), self.partners.shape[1])

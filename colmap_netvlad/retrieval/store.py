@@ -1,4 +1,4 @@
-"""The cache beside the database: descriptors, rankings, settings, in one sqlite file.
+"""The cache beside the database: descriptors, local features, rankings, settings, in one file.
 
 Descriptors are kept by image name, content fingerprint of the photo and fingerprint of the
 model, so that a second run computes nothing, ten new photos cost ten photos, and a photo
@@ -23,6 +23,7 @@ import sqlite_utils
 from numpy.typing import NDArray
 
 from colmap_netvlad.errors import InputError
+from colmap_netvlad.retrieval.local import LocalFeatures
 from colmap_netvlad.retrieval.ranking import NO_PARTNER, Ranking, from_lists
 
 FORMAT = 1
@@ -86,6 +87,7 @@ class Store:
         photos: Sequence[str],
         vectors: NDArray[np.floating],
         seconds: float,
+        local: Sequence[LocalFeatures] = (),
     ) -> None:
         """Keep a batch of descriptors in one transaction; older ones of these images go.
 
@@ -95,6 +97,7 @@ class Store:
             photos: B fingerprints of the photos the vectors were computed from.
             vectors: (B, D) descriptors, L2-normalised.
             seconds: what describing the batch took, s.
+            local: B photos' local features, or none of them.
         """
         share = seconds / max(len(names), 1)
         rows = (
@@ -107,8 +110,20 @@ class Store:
             }
             for name, photo, vector in zip(names, photos, vectors, strict=True)
         )
+        codes = (
+            {
+                "model": model,
+                "image": name,
+                "photo": photo,
+                "height": features.codes.shape[0],
+                "width": features.codes.shape[1],
+                "codes": features.codes.tobytes(),
+            }
+            for name, photo, features in zip(names, photos, local, strict=False)
+        )
         with self._transaction():
             self._db["descriptors"].insert_all(rows, replace=True)
+            self._db["local_features"].insert_all(codes, replace=True)
 
     def seconds(self, model: str, names: Iterable[str]) -> float:
         """Return what describing these images took when it was done, s."""
@@ -138,6 +153,61 @@ class Store:
                     raise KeyError(name)
                 blobs.append(row[0])
         return np.frombuffer(b"".join(blobs), np.float16).reshape(len(blobs), -1)
+
+    # Local features
+
+    def described_locally(self, model: str) -> dict[str, str]:
+        """Return the photo's fingerprint by image name, of all images with local features."""
+        with self._faults():
+            rows = self._db.execute(
+                "SELECT image, photo FROM local_features WHERE model = ?", [model]
+            )
+            return dict(rows.fetchall())
+
+    def local_numbers(self, model: str) -> dict[str, int]:
+        """Return the number of each image's local features, by image name.
+
+        A number is never given again: features of a changed photo have another one.
+        """
+        with self._faults():
+            rows = self._db.execute(
+                "SELECT image, number FROM local_features WHERE model = ?", [model]
+            )
+            return dict(rows.fetchall())
+
+    def read_local(self, number: int) -> LocalFeatures:
+        """Return the local features of that number.
+
+        Raises:
+            KeyError: there are none.
+        """
+        with self._faults():
+            row = self._db.execute(
+                "SELECT height, width, codes FROM local_features WHERE number = ?", [number]
+            ).fetchone()
+        if row is None:
+            raise KeyError(number)
+        height, width, codes = row
+        return LocalFeatures(np.frombuffer(codes, np.int8).reshape(height, width, -1))
+
+    def agreements(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+        """Return what was counted so far, in the order of the numbers.
+
+        Returns:
+            (M, 2) numbers of two local features, lower first; (M,) their agreeing matches;
+            (M,) what counting them took, s.
+        """
+        with self._faults():
+            rows = self._db.execute(
+                "SELECT first, second, matches, seconds FROM agreements ORDER BY first, second"
+            ).fetchall()
+        table = np.array(rows, np.float64).reshape(-1, 4)  # numbers are far below 2^53
+        return table[:, :2].astype(np.int64), table[:, 2].astype(np.int64), table[:, 3]
+
+    def add_agreements(self, rows: Iterable[tuple[int, int, int, float]]) -> None:
+        """Keep (first, second, matches, seconds) of compared pairs in one transaction."""
+        with self._transaction():
+            self._db.conn.executemany("INSERT OR REPLACE INTO agreements VALUES (?, ?, ?, ?)", rows)
 
     # Rankings
 
@@ -241,6 +311,9 @@ class Store:
             )
         if not tables:
             self._create()
+        elif "agreements" not in self._db.table_names():  # the cache of an older version
+            with self._transaction():
+                self._create_local()
 
     def _create(self) -> None:
         # Large pages: a descriptor of 64 KiB then lies in few of them.
@@ -271,8 +344,23 @@ class Store:
                 if_not_exists=True,
             )
             self._db["settings"].create({"key": str, "value": str}, pk="key", if_not_exists=True)
+            self._create_local()
             self._db.execute(f"PRAGMA application_id = {APPLICATION}")
             self._db.execute(f"PRAGMA user_version = {FORMAT}")
+
+    def _create_local(self) -> None:
+        # AUTOINCREMENT: the number of features that are gone is not given again.
+        self._db.execute(
+            "CREATE TABLE IF NOT EXISTS local_features (number INTEGER PRIMARY KEY AUTOINCREMENT,"
+            " model TEXT NOT NULL, image TEXT NOT NULL, photo TEXT NOT NULL,"
+            " height INTEGER NOT NULL, width INTEGER NOT NULL, codes BLOB NOT NULL,"
+            " UNIQUE (model, image))"
+        )
+        self._db.execute(
+            "CREATE TABLE IF NOT EXISTS agreements (first INTEGER, second INTEGER,"
+            " matches INTEGER NOT NULL, seconds REAL NOT NULL, PRIMARY KEY (first, second))"
+            " WITHOUT ROWID"
+        )
 
     def _pragma(self, name: str) -> int:
         return int(self._db.execute(f"PRAGMA {name}").fetchone()[0])

@@ -1,0 +1,41 @@
+"""Local features of a photo: what a network saw at each place, kept small."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, eq=False)
+class LocalFeatures:
+    """One feature for each cell of a grid over a photo.
+
+    Attributes:
+        codes: (h, w, D) int8, each feature stretched to -127..127; zeros where the photo has no
+            texture. A cell is the network's stride, so that distances in cells mean the same in
+            all photos of a project.
+    """
+
+    codes: NDArray[np.int8]
+
+    @classmethod
+    def of(cls, features: NDArray[np.floating]) -> LocalFeatures:
+        """Encode features (D, h, w) of any length."""
+        largest = np.maximum(np.abs(features).max(axis=0), 1e-12)
+        codes = np.round(127 * features / largest).astype(np.int8)
+        return cls(np.ascontiguousarray(codes.transpose(1, 2, 0)))
+
+    def vectors(self) -> NDArray[np.float32]:
+        """Return (h w, D) features, L2-normalised; zero where there is no texture."""
+        vectors = self.codes.reshape(-1, self.codes.shape[2]).astype(np.float32)
+        length = np.sqrt(np.einsum("ij,ij->i", vectors, vectors))
+        vectors /= np.maximum(length, 1e-12)[:, None]
+        return vectors
+
+    def places(self) -> NDArray[np.float32]:
+        """Return (h w, 2) x, y of each feature, in cells."""
+        height, width = self.codes.shape[:2]
+        y, x = np.divmod(np.arange(height * width), width)
+        return np.stack([x, y], axis=1).astype(np.float32)

@@ -1,0 +1,206 @@
+"""Compare candidates place by place, and order them by what agrees.
+
+A global descriptor says that two photos show the same kind of ground. That they show the same
+piece of it is known when places that look alike also lie alike: the local features behind the
+descriptors are matched (mutual nearest neighbours), and the matches that agree on one similarity
+transform (turn, scale, shift) are counted. Photos from above are nearly such transforms of each
+other, photos of facades in part. A pair takes about a hundredth of matching its SIFT features.
+
+The counts then spread by query expansion: the sure neighbours of my sure neighbours are likely
+mine.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from colmap_netvlad.machine import usable_processors
+from colmap_netvlad.progress import step
+from colmap_netvlad.retrieval.fusion import expand, ranking_of
+from colmap_netvlad.retrieval.local import LocalFeatures
+from colmap_netvlad.retrieval.ranking import NO_PARTNER, Ranking
+from colmap_netvlad.retrieval.store import Store
+
+DEPTH = 100
+"""Candidates of each image that are compared."""
+
+TOLERANCE = 1.25
+"""How far from the common transform a match may lie, cells."""
+
+TRANSFORMS = 500
+"""Most transforms tried for a pair (RANSAC)."""
+
+CHANCE = 10
+"""Matches that agree in photos of different ground as well: the median of six flights is 8 to 10
+where the overlap is small. They count as nothing."""
+
+EXPANSION_NEIGHBOURS = 12
+EXPANSION_SHARE = 0.4
+"""Query expansion. These constants were chosen on flights that no model was trained on."""
+
+TAIL = 1e-3
+"""Weight of the candidates' own order, which decides where nothing agrees."""
+
+CACHE_BYTES = 512 << 20
+"""Memory for local features, so that an image's are not read anew for each pair."""
+
+KEEP_PAIRS = 2000
+"""Pairs compared between two writes to the store."""
+
+Pairs = NDArray[np.intp]
+
+
+def rerank(candidates: Ranking, store: Store, model: str, k: int, depth: int = DEPTH) -> Ranking:
+    """Return each image's `k` best partners, its `depth` best candidates compared place by place.
+
+    Counts are kept in the store: pairs compared before are not compared again.
+
+    Args:
+        candidates: by whatever found them, `max(k, depth)` deep where there are as many images.
+        store: has the images' local features; a pair without them is not compared.
+        model: fingerprint of the model that they are from.
+    """
+    count = len(candidates.names)
+    pairs, matches, seconds = _compared(_pairs_of(candidates.top(depth)), candidates, store, model)
+    start = time.perf_counter()
+    sure = np.maximum(matches - CHANCE, 0.0)
+    agreement = sparse.csr_array((sure, tuple(pairs.T)), shape=(count, count))
+    agreement = (agreement + agreement.T).tocsr()
+    agreement.eliminate_zeros()
+    expanded = expand(agreement, EXPANSION_NEIGHBOURS, EXPANSION_SHARE, max(k, depth))
+    similarity = (expanded + TAIL * _own_order(candidates)).tocsr()
+    # Logarithms: twice the matches are not twice as likely to be a true pair.
+    best = ranking_of(similarity.log1p(), candidates.names, candidates.method, k)
+    return replace(
+        candidates,
+        partners=best.partners,
+        scores=best.scores,
+        seconds_search=candidates.seconds_search + seconds + time.perf_counter() - start,
+        compared=True,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """Local features ready to be compared.
+
+    Attributes:
+        vectors: (P, D) L2-normalised.
+        at: (P, 2) x, y, cells.
+    """
+
+    vectors: NDArray[np.float32]
+    at: NDArray[np.float32]
+
+    @classmethod
+    def of(cls, features: LocalFeatures) -> Places:
+        """Decode local features, without places that have no texture."""
+        vectors, at = features.vectors(), features.places()
+        textured = vectors.any(axis=1)
+        return cls(vectors[textured], at[textured])
+
+
+def agreeing_matches(one: Places, other: Places) -> int:
+    """Return how many mutual nearest neighbours agree on one similarity transform."""
+    if min(len(one.at), len(other.at)) < 2:
+        return 0
+    cosines = one.vectors @ other.vectors.T
+    best, back = cosines.argmax(axis=1), cosines.argmax(axis=0)
+    mutual = np.flatnonzero(back[best] == np.arange(len(best)))
+    if len(mutual) < 2:
+        return 0
+    # OpenCV seeds each call alike: the same count every time.
+    _, agree = cv2.estimateAffinePartial2D(
+        one.at[mutual],
+        other.at[best[mutual]],
+        method=cv2.RANSAC,
+        ransacReprojThreshold=TOLERANCE,
+        maxIters=TRANSFORMS,
+        refineIters=0,
+    )
+    return 0 if agree is None else int(agree.sum())
+
+
+def _pairs_of(ranking: Ranking) -> Pairs:
+    """Return (M, 2) the distinct pairs a ranking lists, lower index first, in order."""
+    rows, places = np.nonzero(ranking.partners != NO_PARTNER)
+    pairs = np.sort(np.stack([rows, ranking.partners[rows, places]], axis=1), axis=1)
+    return np.unique(pairs, axis=0).astype(np.intp)
+
+
+def _own_order(ranking: Ranking) -> sparse.csr_array:
+    """Return (N, N) 1 / rank of each image's candidates."""
+    rows, places = np.nonzero(ranking.partners != NO_PARTNER)
+    return sparse.csr_array(
+        (1.0 / (1 + places), (rows, ranking.partners[rows, places])),
+        shape=(len(ranking.names),) * 2,
+    )
+
+
+def _compared(
+    pairs: Pairs, candidates: Ranking, store: Store, model: str
+) -> tuple[Pairs, NDArray[np.float64], float]:
+    """Return the pairs that have local features, their agreeing matches, and the seconds that
+    counting these took."""
+    numbers = store.local_numbers(model)
+    left_out = {name for name, _ in candidates.left_out}
+    ids = np.array([numbers.get(n, 0) * (n not in left_out) for n in candidates.names], np.int64)
+    pairs = pairs[(ids[pairs] > 0).all(axis=1)]
+    keys = np.sort(ids[pairs], axis=1)
+    known, _, _ = store.agreements()
+    missing = ~np.isin(_joined(keys), _joined(known))
+    if missing.any():
+        _compare(pairs[missing], ids, store)
+    known, matches, seconds = store.agreements()
+    at = np.searchsorted(_joined(known), _joined(keys))
+    return pairs, matches[at].astype(np.float64), float(seconds[at].sum())
+
+
+def _joined(keys: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return (M,) one number for each row of (M, 2) positive numbers below 2^31, in their order."""
+    return (keys[:, 0] << 32) + keys[:, 1]
+
+
+def _compare(pairs: Pairs, ids: NDArray[np.int64], store: Store) -> None:
+    """Count the agreeing matches of pairs, ordered by their first image, into the store."""
+    read = _reader(store, ids, pairs[0, 0])
+    starts = np.flatnonzero(np.diff(pairs[:, 0], prepend=-1))
+    rows: list[tuple[int, int, int, float]] = []
+    with (
+        step("Comparing local features", len(pairs)) as bar,
+        ThreadPoolExecutor(usable_processors()) as pool,
+    ):
+        for group in np.split(pairs, starts[1:]):
+            start = time.perf_counter()
+            one = read(int(group[0, 0]))
+            others = [read(int(j)) for j in group[:, 1]]
+            counts = list(pool.map(lambda other, one=one: agreeing_matches(one, other), others))
+            share = (time.perf_counter() - start) / len(group)
+            for (i, j), count in zip(ids[group].tolist(), counts, strict=True):
+                rows.append((min(i, j), max(i, j), count, share))
+            if len(rows) >= KEEP_PAIRS:
+                store.add_agreements(rows)
+                rows = []
+            bar.advance(len(group))
+    store.add_agreements(rows)
+
+
+def _reader(store: Store, ids: NDArray[np.int64], example: int) -> Callable[[int], Places]:
+    """Return a function from an image's index to its features, the latest kept in memory."""
+    size = Places.of(store.read_local(int(ids[example]))).vectors.nbytes
+    most = max(CACHE_BYTES // max(size, 1), 2)
+
+    @lru_cache(maxsize=most)
+    def read(image: int) -> Places:
+        return Places.of(store.read_local(int(ids[image])))
+
+    return read

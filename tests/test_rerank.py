@@ -1,0 +1,234 @@
+"""Candidates compared place by place: what agrees counts, and nothing is compared twice."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from colmap_netvlad.cli import cli
+from colmap_netvlad.retrieval import rerank as module
+from colmap_netvlad.retrieval.local import LocalFeatures
+from colmap_netvlad.retrieval.methods import RetrievalOptions, rank
+from colmap_netvlad.retrieval.ranking import NO_PARTNER, Ranking
+from colmap_netvlad.retrieval.rerank import CHANCE, Places, agreeing_matches, rerank
+from colmap_netvlad.retrieval.store import Store
+
+SIDE, STEP, PHOTOS = 12, 4, 9
+"""A strip of ground seen by photos of SIDE x SIDE cells, each STEP cells after the one before."""
+
+
+def ground(seed: int = 0) -> NDArray[np.float32]:
+    """(D, SIDE, length) random features of the ground under the whole strip."""
+    rng = np.random.default_rng(seed)
+    return rng.normal(size=(32, SIDE, SIDE + STEP * (PHOTOS - 1))).astype(np.float32)
+
+
+def photo(number: int, turns: int = 0, seed: int = 0) -> LocalFeatures:
+    """The features of a photo of the strip, the camera turned by quarter turns."""
+    cut = ground(seed)[:, :, STEP * number : STEP * number + SIDE]
+    return LocalFeatures.of(np.rot90(cut, turns, axes=(1, 2)))
+
+
+def agreeing(one: LocalFeatures, other: LocalFeatures) -> int:
+    return agreeing_matches(Places.of(one), Places.of(other))
+
+
+@pytest.fixture
+def store(tmp_path: Path):
+    with Store(tmp_path / "project.netvlad.db") as opened:
+        keep(opened, range(PHOTOS))
+        yield opened
+
+
+def keep(store: Store, numbers, seed: int = 0, content: str = "") -> None:
+    """Describe photos of the strip; every other one was taken with the camera turned."""
+    names = [f"{n}.jpg" for n in numbers]
+    vectors = np.zeros((len(names), 4), np.float32)
+    local = [photo(n, n % 2, seed) for n in numbers]
+    store.add_descriptors("m", names, [f"{n}{content}" for n in names], vectors, 0, local)
+
+
+def by_chance(seed: int = 1, photos: int = PHOTOS) -> Ranking:
+    """All others of each photo in random order, as if descriptors said nothing."""
+    rng = np.random.default_rng(seed)
+    partners = np.array(
+        [rng.permutation([j for j in range(photos) if j != i]) for i in range(photos)], np.int32
+    )
+    scores = np.tile(np.linspace(1, 0.1, photos - 1, dtype=np.float32), (photos, 1))
+    return Ranking(tuple(f"{i}.jpg" for i in range(photos)), partners, scores, "chance")
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 6), st.integers(1, 6), st.floats(1e-3, 1e3))
+@settings(max_examples=30, deadline=None)
+def test_features_come_back_with_their_directions(seed: int, h: int, w: int, unit: float) -> None:
+    features = np.random.default_rng(seed).normal(size=(64, h, w)) * unit
+    kept = LocalFeatures.of(features)
+    assert kept.codes.shape == (h, w, 64)
+    flat = features.reshape(64, -1).T
+    cosines = (kept.vectors() * flat).sum(axis=1) / np.linalg.norm(flat, axis=1)
+    assert (cosines > 0.999).all()
+    assert [tuple(xy) for xy in kept.places().astype(int)] == [
+        (x, y) for y in range(h) for x in range(w)
+    ]
+
+
+@pytest.mark.parametrize("turns", [0, 1, 2, 3])
+@pytest.mark.parametrize("apart", [0, 1, 2])
+def test_every_place_that_both_photos_show_agrees_whatever_way_the_camera_turned(
+    turns: int, apart: int
+) -> None:
+    shared = SIDE * (SIDE - STEP * apart)
+    assert agreeing(photo(2), photo(2 + apart, turns)) >= shared
+
+
+def test_photos_of_different_ground_agree_by_chance_only() -> None:
+    counts = [agreeing(photo(0, seed=2 * i), photo(0, seed=2 * i + 1)) for i in range(20)]
+    assert max(counts) <= CHANCE + 3
+    assert np.median(counts) <= CHANCE
+
+
+def test_the_count_is_the_same_both_ways_and_every_time() -> None:
+    one, other = photo(0), photo(1, 3)
+    assert len({agreeing(one, other) for _ in range(5)}) == 1
+
+
+def test_places_without_texture_do_not_agree() -> None:
+    mask = np.zeros((32, SIDE, SIDE), np.float32)
+    mask[:, 0, 0] = mask[:, 5, 7] = 1
+    assert agreeing(LocalFeatures.of(np.zeros_like(mask)), photo(0)) == 0
+    assert agreeing(LocalFeatures.of(mask), LocalFeatures.of(mask)) <= 2
+
+
+def test_neighbours_on_the_ground_come_first_whatever_order_they_were_found_in(
+    store: Store,
+) -> None:
+    ranking = rerank(by_chance(), store, "m", PHOTOS - 1)
+    assert ranking.compared
+    for i, row in enumerate(ranking.partners):
+        overlapping = [j for j in range(PHOTOS) if 0 < abs(i - j) <= 2]
+        assert set(row[: len(overlapping)]) == set(overlapping)
+        assert abs(int(row[0]) - i) == 1
+        assert sorted(row) == [j for j in range(PHOTOS) if j != i], "nobody is lost"
+    assert (np.diff(ranking.scores, axis=1) <= 0).all()
+
+
+def test_only_the_best_candidates_are_compared(store: Store, monkeypatch) -> None:
+    asked = []
+
+    def count(one: Places, other: Places) -> int:
+        asked.append(1)
+        return agreeing_matches(one, other)
+
+    monkeypatch.setattr(module, "agreeing_matches", count)
+    candidates = by_chance()
+    ranking = rerank(candidates, store, "m", PHOTOS - 1, depth=2)
+    listed = {
+        frozenset((i, int(j))) for i, row in enumerate(candidates.partners[:, :2]) for j in row
+    }
+    assert len(asked) == len(listed)
+    # What was not compared follows in its own order.
+    for row, own in zip(ranking.partners.tolist(), candidates.partners.tolist(), strict=True):
+        rest = [j for j in row[-2:] if j in own[4:]]
+        assert rest == sorted(rest, key=own.index)
+
+
+def test_what_was_compared_is_not_compared_again(store: Store, monkeypatch) -> None:
+    first = rerank(by_chance(), store, "m", 5)
+    monkeypatch.setattr(module, "agreeing_matches", None)
+    again = rerank(by_chance(), store, "m", 5)
+    np.testing.assert_array_equal(again.partners, first.partners)
+    assert again.seconds_search > 0, "what it took the first time is in the report"
+
+
+def test_a_new_and_a_changed_photo_cost_their_own_pairs_only(store: Store, monkeypatch) -> None:
+    rerank(by_chance(photos=PHOTOS - 1), store, "m", 5)
+    keep(store, [3], seed=9, content="changed")
+    asked = []
+    monkeypatch.setattr(module, "agreeing_matches", lambda one, other: asked.append(1) or 0)
+    rerank(by_chance(), store, "m", 5)
+    assert len(asked) == (PHOTOS - 1) + (PHOTOS - 2)
+
+
+def test_a_run_that_was_stopped_goes_on_where_it_was(store: Store, monkeypatch) -> None:
+    monkeypatch.setattr(module, "KEEP_PAIRS", 1)
+    asked = []
+
+    def stopped(one: Places, other: Places) -> int:
+        asked.append(1)
+        if len(asked) > 20:
+            raise KeyboardInterrupt
+        return agreeing_matches(one, other)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "agreeing_matches", stopped)
+        with pytest.raises(KeyboardInterrupt):
+            rerank(by_chance(), store, "m", 5)
+    kept = len(store.agreements()[0])
+    assert 0 < kept <= 20
+    rest = []
+    monkeypatch.setattr(module, "agreeing_matches", lambda one, other: rest.append(1) or 0)
+    rerank(by_chance(), store, "m", 5)
+    assert len(rest) == PHOTOS * (PHOTOS - 1) // 2 - kept
+
+
+def test_an_image_without_local_features_keeps_its_own_order(store: Store) -> None:
+    candidates = by_chance(photos=PHOTOS + 1)
+    ranking = rerank(candidates, store, "m", PHOTOS)
+    np.testing.assert_array_equal(ranking.partners[PHOTOS], candidates.partners[PHOTOS])
+
+
+def test_an_image_that_was_left_out_stays_out(store: Store) -> None:
+    candidates = by_chance()
+    partners = np.where(candidates.partners == 4, NO_PARTNER, candidates.partners)
+    partners = np.take_along_axis(partners, np.argsort(partners == NO_PARTNER, 1, kind="stable"), 1)
+    partners[4] = NO_PARTNER
+    without = Ranking(
+        candidates.names, partners, candidates.scores, "chance", left_out=(("4.jpg", "is empty"),)
+    )
+    ranking = rerank(without, store, "m", 5)
+    assert (ranking.partners[4] == NO_PARTNER).all()
+    assert 4 not in ranking.partners
+
+
+def test_a_cache_of_before_gets_its_tables(tmp_path: Path) -> None:
+    path = tmp_path / "project.netvlad.db"
+    with Store(path) as store:
+        store.add_descriptors("m", ["a"], ["1"], np.ones((1, 4), np.float32) / 2, 0)
+        store._db.execute("DROP TABLE agreements")
+        store._db.execute("DROP TABLE local_features")
+    with Store(path) as store:
+        assert store.described("m") == {"a": "1"}
+        assert store.described_locally("m") == {}
+        keep(store, [0])
+        assert store.described_locally("m") == {"0.jpg": "0.jpg"}
+
+
+def test_deep_methods_compare_unless_told_not_to(project_copy, tiny_checkpoint: Path) -> None:
+    project = project_copy()
+    plain = rank(project, tiny_checkpoint, RetrievalOptions(k=11, rerank=0))
+    with Store(project.cache) as store:
+        assert store.agreements()[0].shape == (0, 2), "nothing is kept that is not asked for"
+        assert plain.compared is False
+    compared = rank(project, tiny_checkpoint, RetrievalOptions(k=11))
+    assert compared.compared
+    assert compared.notes[0].startswith("12 of 12"), "descriptors without local features"
+    assert (compared.partners != plain.partners).any()
+    assert rank(project, "vlad", RetrievalOptions(k=5)).compared is False
+
+
+def test_the_option_has_the_default_of_the_library() -> None:
+    for command in ("pairs", "compare"):
+        option = next(p for p in cli.commands[command].params if p.name == "rerank")
+        assert option.default == module.DEPTH == RetrievalOptions().rerank
+
+
+def test_fewer_than_no_candidates_are_refused(project_copy) -> None:
+    project = project_copy()
+    result = CliRunner().invoke(cli, ["pairs", "--db", str(project.database), "--rerank", "-1"])
+    assert result.exit_code == 2 and "--rerank" in result.output
