@@ -118,7 +118,7 @@ def test_neighbours_on_the_ground_come_first_whatever_order_they_were_found_in(
     assert (np.diff(ranking.scores, axis=1) <= 0).all()
 
 
-def test_only_the_best_candidates_are_compared(store: Store, monkeypatch) -> None:
+def test_no_more_candidates_are_compared_than_asked_for(store: Store, monkeypatch) -> None:
     asked = []
 
     def count(one: Places, other: Places) -> int:
@@ -126,16 +126,26 @@ def test_only_the_best_candidates_are_compared(store: Store, monkeypatch) -> Non
         return agreeing_matches(one, other)
 
     monkeypatch.setattr(module, "agreeing_matches", count)
+    ranking = rerank(by_chance(), store, "m", PHOTOS - 1, depth=2)
+    assert PHOTOS <= len(asked) <= 2 * PHOTOS
+    for i, row in enumerate(ranking.partners.tolist()):
+        assert sorted(row) == [j for j in range(PHOTOS) if j != i], "the others follow"
+
+
+def test_a_neighbour_whom_the_descriptors_overlooked_is_found_by_way_of_its_neighbours(
+    store: Store,
+) -> None:
     candidates = by_chance()
-    ranking = rerank(candidates, store, "m", PHOTOS - 1, depth=2)
-    listed = {
-        frozenset((i, int(j))) for i, row in enumerate(candidates.partners[:, :2]) for j in row
-    }
-    assert len(asked) == len(listed)
-    # What was not compared follows in its own order.
-    for row, own in zip(ranking.partners.tolist(), candidates.partners.tolist(), strict=True):
-        rest = [j for j in row[-2:] if j in own[4:]]
-        assert rest == sorted(rest, key=own.index)
+    first = np.array([1, 2, 3, 4, 5, 6, 7, 8, 7])  # each found the next photo of the strip first
+    partners = np.array(
+        [
+            [f, *(j for j in row if j != f)]
+            for f, row in zip(first, candidates.partners, strict=True)
+        ]
+    )
+    partners[0] = [1, 8, 7, 6, 5, 4, 3, 2]
+    found = Ranking(candidates.names, partners, candidates.scores, "chance")
+    assert set(rerank(found, store, "m", 2, depth=2).partners[0]) == {1, 2}
 
 
 def test_what_was_compared_is_not_compared_again(store: Store, monkeypatch) -> None:

@@ -25,7 +25,7 @@ from scipy import sparse
 
 from colmap_netvlad.machine import usable_processors
 from colmap_netvlad.progress import step
-from colmap_netvlad.retrieval.fusion import expand, ranking_of
+from colmap_netvlad.retrieval.fusion import expand, keep_best, ranking_of
 from colmap_netvlad.retrieval.local import LocalFeatures
 from colmap_netvlad.retrieval.ranking import NO_PARTNER, Ranking
 from colmap_netvlad.retrieval.store import Store
@@ -60,31 +60,34 @@ Pairs = NDArray[np.intp]
 
 
 def rerank(candidates: Ranking, store: Store, model: str, k: int, depth: int = DEPTH) -> Ranking:
-    """Return each image's `k` best partners, its `depth` best candidates compared place by place.
+    """Return each image's `k` best partners, `depth` candidates compared place by place.
 
-    Counts are kept in the store: pairs compared before are not compared again.
+    The first half are its best candidates; what these teach chooses the others, so that a
+    neighbour whom the descriptors overlooked is found by way of its neighbours. Counts are kept
+    in the store: pairs compared before are not compared again.
 
     Args:
         candidates: by whatever found them, `max(k, depth)` deep where there are as many images.
         store: has the images' local features; a pair without them is not compared.
         model: fingerprint of the model that they are from.
     """
-    count = len(candidates.names)
-    pairs, matches, seconds = _compared(_pairs_of(candidates.top(depth)), candidates, store, model)
-    start = time.perf_counter()
-    sure = np.maximum(matches - CHANCE, 0.0)
-    agreement = sparse.csr_array((sure, tuple(pairs.T)), shape=(count, count))
-    agreement = (agreement + agreement.T).tocsr()
-    agreement.eliminate_zeros()
-    expanded = expand(agreement, EXPANSION_NEIGHBOURS, EXPANSION_SHARE, max(k, depth))
-    similarity = (expanded + TAIL * _own_order(candidates)).tocsr()
+    counted = _Counted(store, model, candidates)
+    own = TAIL * _own_order(candidates)
+    similarity, seconds = own, 0.0
+    for share in (depth - depth // 2, depth // 2):
+        seconds += counted.compare(_pairs_of(keep_best(counted.without(similarity), share)))
+        start = time.perf_counter()
+        agreement = counted.agreement()
+        expanded = expand(agreement, EXPANSION_NEIGHBOURS, EXPANSION_SHARE, max(k, depth))
+        similarity = (expanded + own).tocsr()
+        seconds += time.perf_counter() - start
     # Logarithms: twice the matches are not twice as likely to be a true pair.
     best = ranking_of(similarity.log1p(), candidates.names, candidates.method, k)
     return replace(
         candidates,
         partners=best.partners,
         scores=best.scores,
-        seconds_search=candidates.seconds_search + seconds + time.perf_counter() - start,
+        seconds_search=candidates.seconds_search + seconds,
         compared=True,
     )
 
@@ -130,10 +133,10 @@ def agreeing_matches(one: Places, other: Places) -> int:
     return 0 if agree is None else int(agree.sum())
 
 
-def _pairs_of(ranking: Ranking) -> Pairs:
-    """Return (M, 2) the distinct pairs a ranking lists, lower index first, in order."""
-    rows, places = np.nonzero(ranking.partners != NO_PARTNER)
-    pairs = np.sort(np.stack([rows, ranking.partners[rows, places]], axis=1), axis=1)
+def _pairs_of(similarity: sparse.csr_array) -> Pairs:
+    """Return (M, 2) the distinct pairs of a matrix, lower index first, in order."""
+    entries = similarity.tocoo()
+    pairs = np.sort(np.stack([entries.row, entries.col], axis=1), axis=1)
     return np.unique(pairs, axis=0).astype(np.intp)
 
 
@@ -146,23 +149,49 @@ def _own_order(ranking: Ranking) -> sparse.csr_array:
     )
 
 
-def _compared(
-    pairs: Pairs, candidates: Ranking, store: Store, model: str
-) -> tuple[Pairs, NDArray[np.float64], float]:
-    """Return the pairs that have local features, their agreeing matches, and the seconds that
-    counting these took."""
-    numbers = store.local_numbers(model)
-    left_out = {name for name, _ in candidates.left_out}
-    ids = np.array([numbers.get(n, 0) * (n not in left_out) for n in candidates.names], np.int64)
-    pairs = pairs[(ids[pairs] > 0).all(axis=1)]
-    keys = np.sort(ids[pairs], axis=1)
-    known, _, _ = store.agreements()
-    missing = ~np.isin(_joined(keys), _joined(known))
-    if missing.any():
-        _compare(pairs[missing], ids, store)
-    known, matches, seconds = store.agreements()
-    at = np.searchsorted(_joined(known), _joined(keys))
-    return pairs, matches[at].astype(np.float64), float(seconds[at].sum())
+class _Counted:
+    """The pairs of a ranking's images that were compared, and what agreed."""
+
+    def __init__(self, store: Store, model: str, candidates: Ranking) -> None:
+        numbers = store.local_numbers(model)
+        left_out = {name for name, _ in candidates.left_out}
+        ids = [0 if name in left_out else numbers.get(name, 0) for name in candidates.names]
+        self._ids = np.array(ids, np.int64)
+        self._store = store
+        self._pairs = np.zeros((0, 2), np.intp)
+        self._matches = np.zeros(0)
+
+    def compare(self, pairs: Pairs) -> float:
+        """Count the agreeing matches of pairs that have local features; return the seconds it
+        took, now or when they were first compared."""
+        pairs = pairs[(self._ids[pairs] > 0).all(axis=1)]
+        keys = _joined(np.sort(self._ids[pairs], axis=1))
+        known, matches, seconds = self._store.agreements()
+        missing = ~np.isin(keys, _joined(known))
+        if missing.any():
+            _compare(pairs[missing], self._ids, self._store)
+            known, matches, seconds = self._store.agreements()
+        at = np.searchsorted(_joined(known), keys)
+        self._pairs = np.concatenate([self._pairs, pairs])
+        self._matches = np.concatenate([self._matches, matches[at]])
+        return float(seconds[at].sum())
+
+    def agreement(self) -> sparse.csr_array:
+        """Return (N, N) symmetric: matches that agree beyond chance."""
+        matrix = self._matrix(np.maximum(self._matches - CHANCE, 0.0))
+        matrix.eliminate_zeros()
+        return matrix
+
+    def without(self, similarity: sparse.csr_array) -> sparse.csr_array:
+        """Return a similarity without the pairs compared so far."""
+        done = self._matrix(np.ones(len(self._pairs)))
+        rest = (similarity - similarity * done).tocsr()
+        rest.eliminate_zeros()
+        return rest
+
+    def _matrix(self, values: NDArray[np.float64]) -> sparse.csr_array:
+        upper = sparse.csr_array((values, tuple(self._pairs.T)), shape=(len(self._ids),) * 2)
+        return (upper + upper.T).tocsr()
 
 
 def _joined(keys: NDArray[np.int64]) -> NDArray[np.int64]:
