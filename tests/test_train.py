@@ -274,6 +274,17 @@ def test_correspondences_teach_the_local_features_and_the_centres_follow(
     assert torch.equal(first.aggregation.mean, last.aggregation.mean)
 
 
+def test_correspondences_need_to_know_where_points_are_and_take_no_teacher(
+    flights: list[Scene], options: TrainOptions, tmp_path: Path
+) -> None:
+    options = change(options, loss="correspondence", aggregation="netvlad-adapted")
+    blind = [dataclasses.replace(scene, observations=None) for scene in flights[:2]]
+    with pytest.raises(InputError, match=f"{blind[0].name}.* annotate again"):
+        train(blind, [], options, tmp_path / "run")
+    with pytest.raises(InputError, match="leave teacher out"):
+        train(flights[:2], [], change(options, teacher="start"), tmp_path / "run")
+
+
 def test_head_rate_is_a_factor_on_the_layers_learning_rate(
     flights: list[Scene], options: TrainOptions, tmp_path: Path
 ) -> None:

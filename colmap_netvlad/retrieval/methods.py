@@ -175,6 +175,8 @@ def rank(project: Project, name: str | Path, options: RetrievalOptions | None = 
         model = deep.model_fingerprint(deep.checkpoint_file(options.model or method.model or ""))
         with Store(project.cache) as store:
             ranking = rerank(ranking, store, model, k, compared)
+        note = f"{compared} candidates of each image compared place by place (--rerank)"
+        ranking = replace(ranking, notes=(*ranking.notes, note))
     if k < options.k:
         note = f"k lowered from {options.k} to {k}: the project has {count} images"
         ranking = replace(ranking, notes=(*ranking.notes, note))

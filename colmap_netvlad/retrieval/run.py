@@ -37,6 +37,7 @@ from colmap_netvlad.retrieval.partners import (
     without_same_frame,
 )
 from colmap_netvlad.retrieval.ranking import Ranking
+from colmap_netvlad.retrieval.rerank import DEPTH
 from colmap_netvlad.retrieval.store import Store
 
 NO_RULES = PartnerRules()
@@ -210,10 +211,10 @@ def summary(project: Project, report: PairsReport) -> list[str]:
             f"images: COLMAP's list cannot hold names such as {report.unwritable[0]!r}; "
             f"{report.output.name} has all pairs, and the next command reads it."
         )
-    if report.has_features and ranking.method in CATALOGUE:
+    if report.has_features and ranking.method in CATALOGUE and len(ranking.names) > DEPTH + 1:
         lines.append(
-            "Better       --method hybrid adds the database's SIFT features, and GPS where there "
-            "is any, for little time"
+            "Better       --method hybrid looks for candidates by the database's SIFT features "
+            "too, and by GPS where there is any, for little time"
         )
     return [*lines, f"Next         {_next_command(project, report)}"]
 

@@ -153,6 +153,11 @@ class TrainOptions:
             raise InputError(f"rotations is {self.rotations}; it is 1 or 4.")
         if self.loss == CORRESPONDENCE and "netvlad" not in self.aggregation:
             raise InputError("The correspondence loss teaches the local features of a NetVLAD.")
+        if self.loss == CORRESPONDENCE and self.teacher is not None:
+            raise InputError(
+                "A teacher says how alike photos are, of which the correspondence loss knows "
+                "nothing; leave teacher out, or choose another loss."
+            )
         if self.views and self.frozen is None:
             raise InputError(
                 "views keeps frozen features on disk: say with frozen up to where the trunk stays."

@@ -116,6 +116,21 @@ def train(
     return run.go()
 
 
+def _check_points(scenes: Sequence[Scene], options: TrainOptions) -> None:
+    """Raise InputError where a scene does not say which points its photos show, but has to.
+
+    Pseudo-scenes know: views cut from one photo.
+    """
+    if options.loss != CORRESPONDENCE or options.pseudo_views:
+        return
+    unknown = [scene.name for scene in scenes if scene.observations is None]
+    if unknown:
+        raise InputError(
+            f"The annotation of {', '.join(unknown)} does not say where its photos show which "
+            "points, which the correspondence loss needs: annotate again, or set pseudo_views."
+        )
+
+
 def report_lines(report: TrainReport) -> list[str]:
     """Return what `train` prints: the model, and its scores beside those before training."""
     lines = [f"Model: {report.best}"]
@@ -154,6 +169,7 @@ class Run:
         self.device = choose_device(device)
         self.validation_scenes = [scene.name for scene in validation]
         self.real_scenes = list(scenes)
+        _check_points(self.real_scenes, options)
         self.scenes = [*scenes, *_pseudo_scenes(scenes, options)]
         self.sampler = Sampler(self.scenes, options.for_sampling())
         self.photos = Photos(self.scenes, options)
