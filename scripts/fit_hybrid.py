@@ -2,9 +2,9 @@
 
     python scripts/fit_hybrid.py SCENE.db:PHOTOS [SCENE.db:PHOTOS ...]
 
-Prints the mean average precision of every combination, per flight and on the mean, the best one
-first. Flights without GPS count in the first table only. Databases are only read; descriptors
-are kept in a cache beside them.
+Prints the mean average precision of every combination's candidates (nothing is compared place by
+place), per flight and on the mean, the best one first. Flights without GPS count in the first table
+only. Databases are only read; descriptors are kept in a cache beside them.
 """
 
 from __future__ import annotations

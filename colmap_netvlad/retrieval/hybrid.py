@@ -1,4 +1,4 @@
-"""Deep features and SIFT together: rankings fused, with query expansion."""
+"""Deep features and SIFT together: candidates from both rankings, fused, with query expansion."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
 DEEP_WEIGHT = 1.5
 VLAD_WEIGHT = 1.0
-"""Shares of the two rankings, chosen on flights that the deep model was not trained on
-(`scripts/fit_hybrid.py`, docs/training-log.md)."""
+"""Shares of the two rankings in choosing candidates, chosen on flights that the deep model was not
+trained on (`scripts/fit_hybrid.py`, docs/training-log.md)."""
 
 EXPANSION_NEIGHBOURS = 8
 EXPANSION_SHARE = 0.3
@@ -32,7 +32,7 @@ DEPTH_FACTOR = 4
 
 
 def rank(project: Project, options: RetrievalOptions) -> Ranking:
-    """Rank by the sum of the deep model's and VLAD's similarity, with query expansion.
+    """Rank candidates by the sum of the deep model's and VLAD's similarity, with query expansion.
 
     Args:
         project: its database has SIFT features, and its photo folder is known.

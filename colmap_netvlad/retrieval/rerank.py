@@ -45,7 +45,7 @@ where the overlap is small. They count as nothing."""
 
 EXPANSION_NEIGHBOURS = 12
 EXPANSION_SHARE = 0.4
-"""Query expansion. These constants were chosen on flights that no model was trained on."""
+"""Query expansion. What these constants were chosen by: docs/training-log.md, section 9."""
 
 TAIL = 1e-3
 """Weight of the candidates' own order, which decides where nothing agrees."""
@@ -225,8 +225,8 @@ def _compare(pairs: Pairs, ids: NDArray[np.int64], store: Store) -> None:
 
 def _reader(store: Store, ids: NDArray[np.int64], example: int) -> Callable[[int], Places]:
     """Return a function from an image's index to its features, the latest kept in memory."""
-    size = Places.of(store.read_local(int(ids[example]))).vectors.nbytes
-    most = max(CACHE_BYTES // max(size, 1), 2)
+    values = store.read_local(int(ids[example])).codes.size
+    most = max(CACHE_BYTES // (4 * max(values, 1)), 2)
 
     @lru_cache(maxsize=most)
     def read(image: int) -> Places:
