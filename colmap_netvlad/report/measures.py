@@ -126,7 +126,7 @@ MEASURES: tuple[Measure, ...] = (
     Measure("seconds_describe", "Describing (T_fe)", -1, lambda m: m.seconds_describe, seconds,
             "Global description of all images; local features are there already.", TIME),
     Measure("seconds_search", "Searching (T_nns)", -1, lambda m: m.seconds_search, seconds,
-            "Nearest neighbour search.", TIME),
+            "Nearest neighbours, and comparing candidates place by place.", TIME),
     Measure("seconds_retrieval", "Retrieval in all", -1, _efficiency, seconds,
             "T_fe + T_nns (paper, eq. 20).", TIME),
     Measure("seconds_match", "Matching", -1, lambda m: m.seconds_match, seconds,
