@@ -79,7 +79,10 @@ def test_a_checkpoint_by_path_is_a_method(project_copy: MakeProject, checkpoint:
     ranking = rank(project_copy(), str(checkpoint), RetrievalOptions(k=4))
     check_ranking(ranking, 12, 4)
     assert ranking.method == "tiny"
-    assert ranking.notes == ("12 of 12 descriptors computed",)
+    assert ranking.notes == (
+        "12 of 12 descriptors computed",
+        "11 candidates of each image compared place by place (--rerank)",
+    )
     assert ranking.seconds_describe > 0
 
 
