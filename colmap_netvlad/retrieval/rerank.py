@@ -22,6 +22,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
+from threadpoolctl import threadpool_limits
 
 from colmap_netvlad.machine import usable_processors
 from colmap_netvlad.progress import step
@@ -206,6 +207,8 @@ def _compare(pairs: Pairs, ids: NDArray[np.int64], store: Store) -> None:
     rows: list[tuple[int, int, int, float]] = []
     with (
         step("Comparing local features", len(pairs)) as bar,
+        # A pair is too little work to share: a thread for each of several pairs is twice as fast.
+        threadpool_limits(1, "blas"),
         ThreadPoolExecutor(usable_processors()) as pool,
     ):
         for group in np.split(pairs, starts[1:]):
