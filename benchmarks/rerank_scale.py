@@ -6,7 +6,7 @@ A square flight over simulated ground: a random feature for each cell, photos of
 a grid with 75 % overlap, turned by quarter turns, with noise. Candidates are the photos nearest
 by position, in a poor order: a tenth of each photo's list are photos from anywhere. Each line is
 measured in a process of its own. Recall is the share of the 24 photos around each photo (those
-that overlap by a quarter or more in both directions) among its 24 best partners, before and after.
+that overlap by half or more in both directions) among its 24 best partners, before and after.
 """
 
 from __future__ import annotations

@@ -159,6 +159,7 @@ class _Counted:
         ids = [0 if name in left_out else numbers.get(name, 0) for name in candidates.names]
         self._ids = np.array(ids, np.int64)
         self._store = store
+        self._known = store.agreements()
         self._pairs = np.zeros((0, 2), np.intp)
         self._matches = np.zeros(0)
 
@@ -167,11 +168,11 @@ class _Counted:
         took, now or when they were first compared."""
         pairs = pairs[(self._ids[pairs] > 0).all(axis=1)]
         keys = _joined(np.sort(self._ids[pairs], axis=1))
-        known, matches, seconds = self._store.agreements()
-        missing = ~np.isin(keys, _joined(known))
+        missing = ~np.isin(keys, _joined(self._known[0]))
         if missing.any():
             _compare(pairs[missing], self._ids, self._store)
-            known, matches, seconds = self._store.agreements()
+            self._known = self._store.agreements()
+        known, matches, seconds = self._known
         at = np.searchsorted(_joined(known), keys)
         self._pairs = np.concatenate([self._pairs, pairs])
         self._matches = np.concatenate([self._matches, matches[at]])
