@@ -18,24 +18,21 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+from colmap_netvlad.colmap.database import copy_database, image_names
 from colmap_netvlad.compare.models import copy_pairs
-from colmap_netvlad.database import copy_database, image_names
+from colmap_netvlad.graph.pair import IndexPair, as_pair
+from colmap_netvlad.graph.verified import CORRECT_MATCHES, correct_pairs, verified_by_name
 from colmap_netvlad.mapping.incremental import map_incremental
 from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.mapping.summary import combine
-from colmap_netvlad.matching import match_pairs
-from colmap_netvlad.metrics import (
-    CORRECT_MATCHES,
-    as_pair,
-    correct_pairs,
-    mean_average_precision,
-    verified_by_name,
-)
+from colmap_netvlad.matching.run import match_pairs
+from colmap_netvlad.metrics import mean_average_precision
 from colmap_netvlad.models.catalogue import DEFAULT
+from colmap_netvlad.pairs.rounds import FITTED, find_candidates, replay, take_turns
 from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval.fusion import similarity_matrix
-from colmap_netvlad.retrieval.methods import RetrievalOptions, rank
-from colmap_netvlad.rounds import FITTED, IndexPair, find_candidates, replay, take_turns
+from colmap_netvlad.retrieval.options import RetrievalOptions
+from colmap_netvlad.retrieval.rank import rank
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 from fit_rounds import read_scene, truth_of

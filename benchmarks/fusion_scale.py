@@ -19,18 +19,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from colmap_netvlad.positions import Positions
+from colmap_netvlad.cache.ranking import Ranking
+from colmap_netvlad.pairs.rounds import next_round
+from colmap_netvlad.photos.positions import Positions
 from colmap_netvlad.retrieval.fusion import expand, fuse, ranking_of, similarity_matrix
 from colmap_netvlad.retrieval.gps import near_first
-from colmap_netvlad.retrieval.hybrid import (
+from colmap_netvlad.retrieval.methods.hybrid import (
     DEEP_WEIGHT,
     EXPANSION_NEIGHBOURS,
     EXPANSION_SHARE,
     VLAD_WEIGHT,
     fusion_depth,
 )
-from colmap_netvlad.retrieval.ranking import Ranking
-from colmap_netvlad.rounds import next_round
 
 K = 30
 OVERLAP = 3.0

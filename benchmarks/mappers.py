@@ -22,7 +22,7 @@ import pycolmap
 from rich.console import Console
 from rich.table import Table
 
-from colmap_netvlad import engine
+from colmap_netvlad.colmap import engine
 from colmap_netvlad.mapping import MAPPERS
 from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.mapping.summary import combine

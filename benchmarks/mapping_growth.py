@@ -25,7 +25,7 @@ import pycolmap
 from rich.console import Console
 from rich.table import Table
 
-from colmap_netvlad import engine
+from colmap_netvlad.colmap import engine
 from colmap_netvlad.demo.simulate import SimulationOptions, simulate_flight
 from colmap_netvlad.mapping import MAPPERS
 from colmap_netvlad.mapping.options import MappingOptions

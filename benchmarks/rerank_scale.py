@@ -23,10 +23,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_netvlad.retrieval.local import LocalFeatures
-from colmap_netvlad.retrieval.ranking import Ranking
-from colmap_netvlad.retrieval.rerank import DEPTH, rerank
-from colmap_netvlad.retrieval.store import Store
+from colmap_netvlad.cache.cells import LocalFeatures
+from colmap_netvlad.cache.ranking import Ranking
+from colmap_netvlad.cache.store import Store
+from colmap_netvlad.retrieval.options import COMPARED
+from colmap_netvlad.retrieval.rerank import rerank
 
 WIDTH, HEIGHT, DIM = 24, 18, 112
 """The grid and the length of features of `netvlad-o-lite`."""
@@ -66,13 +67,13 @@ def candidates(names: list[str], side: int, rng: np.random.Generator) -> Ranking
     for i in range(len(names)):
         apart = np.linalg.norm(place - place[i], axis=1) + rng.exponential(2.0, len(names))
         apart[i] = np.inf
-        near = np.argsort(apart)[:DEPTH]
-        stray = rng.random(DEPTH) < STRAY
+        near = np.argsort(apart)[:COMPARED]
+        stray = rng.random(COMPARED) < STRAY
         others = np.setdiff1d(np.arange(len(names)), [*near, i])
         near[stray] = rng.choice(others, stray.sum(), replace=False)
         rows.append(near)
     partners = np.array(rows, np.int32)
-    scores = np.tile(np.linspace(1, 0, DEPTH, dtype=np.float32), (len(names), 1))
+    scores = np.tile(np.linspace(1, 0, COMPARED, dtype=np.float32), (len(names), 1))
     return Ranking(tuple(names), partners, scores, "simulated")
 
 

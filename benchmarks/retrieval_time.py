@@ -17,14 +17,16 @@ import tempfile
 import time
 from pathlib import Path
 
-from colmap_netvlad.features import extract_features
-from colmap_netvlad.images import find_photos, load_batches
+from colmap_netvlad.colmap.features import extract_features
 from colmap_netvlad.models.catalogue import CATALOGUE
 from colmap_netvlad.models.checkpoint import load_model
+from colmap_netvlad.photos.decode import load_batches
+from colmap_netvlad.photos.files import find_photos
 from colmap_netvlad.project import Project
-from colmap_netvlad.retrieval import bow
-from colmap_netvlad.retrieval.deep import BATCH_SIZE
-from colmap_netvlad.retrieval.methods import RetrievalOptions, rank
+from colmap_netvlad.retrieval.methods import bow
+from colmap_netvlad.retrieval.methods.deep import BATCH_SIZE
+from colmap_netvlad.retrieval.options import RetrievalOptions
+from colmap_netvlad.retrieval.rank import rank
 
 SCENE = Path(__file__).parents[1] / ".." / "shared" / "data" / "sheffield_cross"
 MODELS = ("netvlad-o", "netvlad-o-lite")

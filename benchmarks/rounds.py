@@ -18,13 +18,15 @@ from pathlib import Path
 import numpy as np
 from scipy import sparse
 
-from colmap_netvlad.database import image_names
-from colmap_netvlad.metrics import CORRECT_MATCHES
+from colmap_netvlad.cache.ranking import NO_PARTNER, Ranking
+from colmap_netvlad.colmap.database import image_names
+from colmap_netvlad.graph.pair import IndexPair
+from colmap_netvlad.graph.verified import CORRECT_MATCHES
+from colmap_netvlad.pairs.rounds import FITTED, replay
 from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval.fusion import similarity_matrix
-from colmap_netvlad.retrieval.methods import RetrievalOptions, rank
-from colmap_netvlad.retrieval.ranking import NO_PARTNER, Ranking
-from colmap_netvlad.rounds import FITTED, IndexPair, replay
+from colmap_netvlad.retrieval.options import RetrievalOptions
+from colmap_netvlad.retrieval.rank import rank
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 from fit_rounds import read_scene, truth_of

@@ -21,8 +21,8 @@ from pathlib import Path
 
 import numpy as np
 
+from colmap_netvlad.cache.store import Store
 from colmap_netvlad.retrieval.search import nearest
-from colmap_netvlad.retrieval.store import Store
 
 BATCH = 64
 GROUP = 16  # photos that see the same ground

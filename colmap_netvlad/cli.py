@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from colmap_netvlad import __version__
-from colmap_netvlad.errors import EXIT_PARTIAL
+from colmap_netvlad.runtime.errors import EXIT_PARTIAL
 from colmap_netvlad.training.command import SettingsCommand
 
 if TYPE_CHECKING:
-    from colmap_netvlad.matching import MatchReport
+    from colmap_netvlad.matching.run import MatchReport
     from colmap_netvlad.project import Project
 
 Command = TypeVar("Command", bound=Callable[..., Any])
@@ -120,7 +120,7 @@ def verbose_option(command: Command) -> Command:
 
     def set_verbosity(context: click.Context, parameter: click.Parameter, verbose: bool) -> None:
         if not context.resilient_parsing:
-            from colmap_netvlad import progress
+            from colmap_netvlad.runtime import progress
 
             progress.verbose = verbose
 
@@ -203,9 +203,9 @@ def features(images: Path, database: Path, **options: Any) -> None:
     have features are passed over, so a stopped run goes on where it stopped. Photos that are
     truncated, empty or no photos are listed at the end and left out (exit code 3).
     """
-    from colmap_netvlad.features import FeatureOptions, extract_features
+    from colmap_netvlad.cache.store import Store
+    from colmap_netvlad.colmap.features import FeatureOptions, extract_features
     from colmap_netvlad.project import Project
-    from colmap_netvlad.retrieval.store import Store
 
     report = extract_features(images, database, FeatureOptions(**options))
     with Store(Project(database, images).cache) as store:
@@ -284,10 +284,7 @@ def reconstruct(
     """
     from rich.console import Console
 
-    from colmap_netvlad.mapping.options import MappingOptions
-    from colmap_netvlad.matching import MatchOptions
-    from colmap_netvlad.project import find_project
-    from colmap_netvlad.reconstruct import (
+    from colmap_netvlad.commands.reconstruct import (
         ReconstructOptions,
         check_mapper,
         map_and_report,
@@ -295,7 +292,10 @@ def reconstruct(
         report_table,
         working_copy,
     )
-    from colmap_netvlad.reconstruct import reconstruct as run
+    from colmap_netvlad.commands.reconstruct import reconstruct as run
+    from colmap_netvlad.mapping.options import MappingOptions
+    from colmap_netvlad.matching.run import MatchOptions
+    from colmap_netvlad.project import find_project
 
     check_mapper(mapper)
     project = find_project(database, images)
@@ -348,12 +348,12 @@ def match(
     This writes matches into the database, where COLMAP keeps them (--copy does not); one of
     COLMAP 3.x is brought to the schema of COLMAP 4. A stopped run goes on where it stopped.
     """
-    from colmap_netvlad.connect import verified_components
-    from colmap_netvlad.database import image_names
-    from colmap_netvlad.matching import MatchOptions, match_pairs
-    from colmap_netvlad.pairs import read_pairs
+    from colmap_netvlad.colmap.database import image_names
+    from colmap_netvlad.commands.reconstruct import view_graph_lines, working_copy
+    from colmap_netvlad.graph.verified import verified_components
+    from colmap_netvlad.matching.run import MatchOptions, match_pairs
+    from colmap_netvlad.pairs.lists import read_pairs
     from colmap_netvlad.project import find_project
-    from colmap_netvlad.reconstruct import view_graph_lines, working_copy
 
     project = find_project(database, images)
     listed = pairs or project.pairs
@@ -382,9 +382,9 @@ def match_and_print_rounds(
     seed: int,
 ) -> MatchReport:
     """Match in rounds and print a line for each."""
-    from colmap_netvlad.match_rounds import rank_and_match_in_rounds, rounds_lines
-    from colmap_netvlad.matching import MatchOptions
-    from colmap_netvlad.retrieval.methods import RetrievalOptions
+    from colmap_netvlad.matching.rounds import rank_and_match_in_rounds, rounds_lines
+    from colmap_netvlad.matching.run import MatchOptions
+    from colmap_netvlad.retrieval.options import RetrievalOptions
 
     options = RetrievalOptions(k=k, device=device, seed=seed)
     spent = rank_and_match_in_rounds(
@@ -440,9 +440,9 @@ def add(
     computed: a new photo is paired with its k most likely partners among the old ones. The old
     model is left as it is, the extended one is written beside it.
     """
-    from colmap_netvlad.add import AddOptions, add_lines, add_photos, newest_model
+    from colmap_netvlad.commands.add import AddOptions, add_lines, add_photos, newest_model
     from colmap_netvlad.project import find_project
-    from colmap_netvlad.retrieval.methods import RetrievalOptions
+    from colmap_netvlad.retrieval.options import RetrievalOptions
 
     project = find_project(database, images)
     options = AddOptions(
@@ -544,11 +544,11 @@ def pairs(
     Never writes to the database. Descriptors are kept in project.netvlad.db beside it: a second
     run computes none, ten new photos cost ten.
     """
+    from colmap_netvlad.commands.pairs import make_pairs, summary
     from colmap_netvlad.models.catalogue import DEFAULT
+    from colmap_netvlad.pairs.rules import PartnerRules
     from colmap_netvlad.project import find_project
-    from colmap_netvlad.retrieval.methods import RetrievalOptions
-    from colmap_netvlad.retrieval.partners import PartnerRules
-    from colmap_netvlad.retrieval.run import make_pairs, summary
+    from colmap_netvlad.retrieval.options import RetrievalOptions
 
     project = find_project(database, images, cache)
     options = RetrievalOptions(
@@ -580,8 +580,8 @@ def viewgraph(database: Path | None, graphml: Path | None) -> None:
     Components, images per pair, and the images and pairs whose loss splits the model. The
     database stays as it is.
     """
+    from colmap_netvlad.graph.viewgraph import read_view_graph, statistics_lines
     from colmap_netvlad.project import locate_database
-    from colmap_netvlad.viewgraph import read_view_graph, statistics_lines
 
     graph = read_view_graph(locate_database(database))
     if graphml is not None:
@@ -620,7 +620,7 @@ def demo(output: Path, method: str | None, seed: int) -> None:
 
     from rich.console import Console
 
-    from colmap_netvlad.demo.run import DEMO_FLIGHT, run_demo
+    from colmap_netvlad.commands.demo import DEMO_FLIGHT, run_demo
     from colmap_netvlad.models.catalogue import DEFAULT
 
     console = Console(highlight=False, soft_wrap=True)
@@ -688,12 +688,11 @@ def compare(
     killed run goes on where it stopped, and methods can be added in a later run. A method that
     fails is listed at the end, the others finish (exit code 3).
     """
-    from colmap_netvlad.compare import CompareOptions
-    from colmap_netvlad.compare import compare as run
-    from colmap_netvlad.compare.pipeline import parse_ks
+    from colmap_netvlad.commands.compare import CompareOptions, parse_ks
+    from colmap_netvlad.commands.compare import compare as run
     from colmap_netvlad.project import find_project
     from colmap_netvlad.report.comparison import print_comparison
-    from colmap_netvlad.retrieval.methods import RetrievalOptions
+    from colmap_netvlad.retrieval.options import RetrievalOptions
 
     def confirm(question: str) -> bool:
         return yes or (sys.stdin.isatty() and click.confirm(question, err=True))
@@ -754,7 +753,7 @@ def annotate(
     Each scene is reconstructed; the number of common 3D points of its photos (GS) is saved as
     annotation.npz. Scenes annotated before are passed over.
     """
-    from colmap_netvlad.training import annotate as annotation
+    from colmap_netvlad.commands import annotate as annotation
 
     options = annotation.AnnotateOptions(method, k, output, databases, mapper, seed)
     report = annotation.annotate(datasets, options)

@@ -5,42 +5,12 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Mapping
-from pathlib import Path
 
 import numpy as np
 
-from colmap_netvlad.database import open_database
-from colmap_netvlad.retrieval.ranking import NO_PARTNER, Ranking
-
-CORRECT_MATCHES = 15
-"""A pair is correct with MORE verified matches than this (section 4.1.2)."""
-
-Pair = tuple[str, str]
-"""Two image names in alphabetical order: the key of a pair in every set and table here."""
-
-
-def as_pair(name1: str, name2: str) -> Pair:
-    """Return the pair of two images, the same whatever their order."""
-    return (name1, name2) if name1 <= name2 else (name2, name1)
-
-
-def verified_by_name(database: Path) -> dict[Pair, int]:
-    """Return the verified (inlier) matches of every pair tried in a COLMAP database.
-
-    Pairs that were tried and failed have 0.
-
-    Raises:
-        InputError: the database cannot be read.
-    """
-    with open_database(database) as opened:
-        names = {row.image_id: row.name for row in opened.images()}
-        counts = opened.verified_matches()
-    return {as_pair(names[a], names[b]): count for (a, b), count in counts.items()}
-
-
-def correct_pairs(verified: Mapping[Pair, int], more_than: int = CORRECT_MATCHES) -> set[Pair]:
-    """Return the pairs with more than `more_than` verified matches."""
-    return {as_pair(*pair) for pair, count in verified.items() if count > more_than}
+from colmap_netvlad.cache.ranking import NO_PARTNER, Ranking
+from colmap_netvlad.graph.pair import Pair, as_pair
+from colmap_netvlad.graph.verified import correct_pairs
 
 
 def accuracy(pairs: Iterable[tuple[str, str]], verified: Mapping[Pair, int]) -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from colmap_netvlad.errors import InputError
+from colmap_netvlad.runtime.errors import InputError
 
 DATABASE_NAMES = ("project.db", "database.db")
 """What a COLMAP workspace calls its database, in the order they are looked for."""
@@ -122,7 +122,7 @@ def find_project(
     Raises:
         InputError: no database, no such photo folder, or a damaged cache.
     """
-    from colmap_netvlad.retrieval.store import remembered_images
+    from colmap_netvlad.cache.store import remembered_images
 
     database = locate_database(database)
     remembered = remembered_images(Project(database, None, cache).cache)

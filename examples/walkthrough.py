@@ -11,13 +11,14 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+from colmap_netvlad.colmap.features import FeatureOptions, extract_features
+from colmap_netvlad.commands.pairs import make_pairs
+from colmap_netvlad.commands.reconstruct import reconstruct
 from colmap_netvlad.demo.render import FlightOptions, render_flight
-from colmap_netvlad.features import FeatureOptions, extract_features
 from colmap_netvlad.models.catalogue import DEFAULT
 from colmap_netvlad.project import open_project
-from colmap_netvlad.reconstruct import reconstruct
-from colmap_netvlad.retrieval.methods import RetrievalOptions, rank
-from colmap_netvlad.retrieval.run import make_pairs
+from colmap_netvlad.retrieval.options import RetrievalOptions
+from colmap_netvlad.retrieval.rank import rank
 
 
 def main(folder: Path, method: str = DEFAULT) -> None:

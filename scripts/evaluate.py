@@ -13,8 +13,7 @@ from pathlib import Path
 
 import click
 
-from colmap_netvlad.retrieval.methods import RetrievalOptions
-from colmap_netvlad.retrieval.rerank import DEPTH
+from colmap_netvlad.retrieval.options import COMPARED, RetrievalOptions
 from colmap_netvlad.training.evaluate import evaluate, markdown
 from colmap_netvlad.training.scenes import load_dataset
 
@@ -23,7 +22,7 @@ from colmap_netvlad.training.scenes import load_dataset
 @click.argument("datasets", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option("--databases", required=True, type=click.Path(path_type=Path))
 @click.option("--method", "methods", multiple=True, default=["bow", "vlad"], show_default=True)
-@click.option("--rerank", default=DEPTH, show_default=True, help="As in `pairs`.")
+@click.option("--rerank", default=COMPARED, show_default=True, help="As in `pairs`.")
 def main(
     datasets: tuple[Path, ...], databases: Path, methods: tuple[str, ...], rerank: int
 ) -> None:

@@ -14,15 +14,17 @@ from itertools import product
 
 from fit_rounds import read_scene
 
-from colmap_netvlad.database import image_names
-from colmap_netvlad.metrics import correct_pairs, mean_average_precision, verified_by_name
+from colmap_netvlad.cache.ranking import Ranking
+from colmap_netvlad.colmap.database import image_names
+from colmap_netvlad.flight import read_positions
+from colmap_netvlad.graph.verified import correct_pairs, verified_by_name
+from colmap_netvlad.metrics import mean_average_precision
 from colmap_netvlad.models.catalogue import DEFAULT
-from colmap_netvlad.positions import read_positions
 from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval import gps
 from colmap_netvlad.retrieval.fusion import expand, fuse, ranking_of
-from colmap_netvlad.retrieval.methods import RetrievalOptions, rank
-from colmap_netvlad.retrieval.ranking import Ranking
+from colmap_netvlad.retrieval.options import RetrievalOptions
+from colmap_netvlad.retrieval.rank import rank
 
 DEEP = (0.3, 0.5, 0.7, 1.0, 1.5, 2.0)
 NEIGHBOURS = (5, 8, 12)

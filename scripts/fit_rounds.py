@@ -1,4 +1,4 @@
-"""Fit the weights of `colmap_netvlad.rounds` on exhaustively matched training flights.
+"""Fit the weights of `colmap_netvlad.pairs.rounds` on exhaustively matched training flights.
 
     python scripts/fit_rounds.py --method hybrid SCENE.db:PHOTOS [SCENE.db:PHOTOS ...]
 
@@ -18,13 +18,15 @@ import numpy as np
 from numpy.typing import NDArray
 from sklearn.linear_model import LogisticRegression
 
-from colmap_netvlad.database import image_names, open_database
-from colmap_netvlad.metrics import CORRECT_MATCHES
+from colmap_netvlad.colmap.database import image_names, open_database
+from colmap_netvlad.graph.pair import IndexPair
+from colmap_netvlad.graph.verified import CORRECT_MATCHES
+from colmap_netvlad.pairs.rounds import FITTED, Weights, find_candidates, replay
 from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval.fusion import similarity_matrix
-from colmap_netvlad.retrieval.hybrid import fusion_depth
-from colmap_netvlad.retrieval.methods import RetrievalOptions, rank
-from colmap_netvlad.rounds import FITTED, IndexPair, Weights, find_candidates, replay
+from colmap_netvlad.retrieval.methods.hybrid import fusion_depth
+from colmap_netvlad.retrieval.options import RetrievalOptions
+from colmap_netvlad.retrieval.rank import rank
 
 BUDGETS = (2, 4, 6, 10)
 """Pairs for each image."""

@@ -22,15 +22,16 @@ import numpy as np
 import torch
 from torch.nn import functional
 
-from colmap_netvlad import progress
-from colmap_netvlad.errors import InputError
-from colmap_netvlad.images import BadPhoto, decode_photo, find_photos
 from colmap_netvlad.models.aggregation import NetVLAD
 from colmap_netvlad.models.backbones import BACKBONES, load_trunk
 from colmap_netvlad.models.checkpoint import save_checkpoint
 from colmap_netvlad.models.describe import choose_device, choose_precision, prepare_trunk
 from colmap_netvlad.models.network import GlobalDescriptor
 from colmap_netvlad.models.trunk import Trunk
+from colmap_netvlad.photos.decode import decode_photo
+from colmap_netvlad.photos.files import BadPhoto, find_photos
+from colmap_netvlad.runtime import progress
+from colmap_netvlad.runtime.errors import InputError
 
 
 @click.command(help=__doc__)

@@ -16,8 +16,8 @@ from pathlib import Path
 
 import click
 
-from colmap_netvlad.errors import InputError
-from colmap_netvlad.files import write_atomically
+from colmap_netvlad.runtime.errors import InputError
+from colmap_netvlad.runtime.files import write_atomically
 from colmap_netvlad.training.options import TrainOptions
 from colmap_netvlad.training.run import TrainReport, train
 from colmap_netvlad.training.scenes import load_dataset

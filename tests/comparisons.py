@@ -7,16 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from colmap_netvlad import metrics
 from colmap_netvlad.compare.evidence import Evidence, Plan
 from colmap_netvlad.compare.figures import retrieval_figures
 from colmap_netvlad.compare.finds import single_finds
-from colmap_netvlad.compare.result import (
-    Comparison,
-    MethodResult,
-    ModelFigures,
-)
-from colmap_netvlad.metrics import as_pair
+from colmap_netvlad.compare.result import Comparison, MethodResult, ModelFigures
+from colmap_netvlad.graph.pair import as_pair
+from colmap_netvlad.graph.verified import correct_pairs
 
 NOISE = {"netvlad-o": 6.0, "bow": 14.0, "vlad": 25.0}
 """How far a method's idea of a photo's place is off, m; lines are 20 m apart."""
@@ -53,7 +49,7 @@ def made_up(
     for pair in sorted(set().union(*(at[ks[-1]] for at in pairs_at.values()))):
         apart = float(np.linalg.norm(place[index[pair[0]]] - place[index[pair[1]]]))
         verified[pair] = int(2000 * np.exp(-apart / 18)) if apart < 60 else 0
-    truth = metrics.correct_pairs(verified)
+    truth = correct_pairs(verified)
     points = np.column_stack(
         [generator.uniform(-30, 20 * side + 30, (4000, 2)), generator.normal(0, 3, 4000)]
     )

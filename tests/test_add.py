@@ -9,16 +9,16 @@ from pathlib import Path
 
 import pytest
 
-from colmap_netvlad.add import AddOptions, add_photos, newest_model
-from colmap_netvlad.database import image_names, open_database
+from colmap_netvlad.colmap.database import image_names, open_database
+from colmap_netvlad.colmap.features import FeatureOptions, extract_features
+from colmap_netvlad.commands.add import AddOptions, add_photos, newest_model
 from colmap_netvlad.demo.render import Flight
-from colmap_netvlad.errors import InputError
-from colmap_netvlad.features import FeatureOptions, extract_features
 from colmap_netvlad.mapping.incremental import map_incremental
 from colmap_netvlad.mapping.options import MappingOptions
-from colmap_netvlad.matching import match_pairs
+from colmap_netvlad.matching.run import match_pairs
 from colmap_netvlad.project import Project
-from colmap_netvlad.retrieval.methods import RetrievalOptions
+from colmap_netvlad.retrieval.options import RetrievalOptions
+from colmap_netvlad.runtime.errors import InputError
 
 OPTIONS = AddOptions("vlad", RetrievalOptions(k=5), features=FeatureOptions(max_features=1500))
 NEW = 3

@@ -17,12 +17,12 @@ import pytest
 from click.testing import CliRunner
 
 from colmap_netvlad.cli import cli
-from colmap_netvlad.database import open_database
+from colmap_netvlad.colmap.database import open_database
+from colmap_netvlad.commands import annotate as module
+from colmap_netvlad.commands.annotate import AnnotateOptions, annotate, find_scenes, table_lines
 from colmap_netvlad.demo.render import Flight
-from colmap_netvlad.errors import EXIT_PARTIAL, InputError
 from colmap_netvlad.project import Project
-from colmap_netvlad.training import annotate as module
-from colmap_netvlad.training.annotate import AnnotateOptions, annotate, find_scenes, table_lines
+from colmap_netvlad.runtime.errors import EXIT_PARTIAL, InputError
 from colmap_netvlad.training.scenes import (
     ANNOTATION,
     VERSION,
@@ -203,7 +203,7 @@ def test_a_killed_run_goes_on_with_the_pairs_already_matched(
     shutil.copy(project_copy(matched=True).database, work / "database.db")
     (work / "sparse" / "0").mkdir(parents=True)
     (work / "sparse" / "0" / "half").write_text("")
-    from colmap_netvlad import matching
+    from colmap_netvlad.matching import run as matching
 
     reports = []
     original = matching.match_pairs

@@ -16,12 +16,13 @@ import pytest
 from click.testing import CliRunner, Result
 from photos import save_jpeg, scene
 
-from colmap_netvlad import engine, matching
 from colmap_netvlad.cli import cli
-from colmap_netvlad.database import image_names, open_database
-from colmap_netvlad.errors import InputError
-from colmap_netvlad.files import write_atomically
+from colmap_netvlad.colmap import engine
+from colmap_netvlad.colmap.database import image_names, open_database
+from colmap_netvlad.matching import run as matching
 from colmap_netvlad.project import Project
+from colmap_netvlad.runtime.errors import InputError
+from colmap_netvlad.runtime.files import write_atomically
 
 MakeProject = Callable[..., Project]
 
@@ -285,7 +286,7 @@ def assert_no_leftovers(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "stage", ["colmap_netvlad.features:read_header", "pycolmap:extract_features"]
+    "stage", ["colmap_netvlad.colmap.features:read_header", "pycolmap:extract_features"]
 )
 def test_ctrl_c_in_features_is_clean_and_the_next_run_completes(stage: str, tmp_path: Path) -> None:
     images, database = tmp_path / "images", tmp_path / "project.db"
@@ -319,7 +320,7 @@ def test_ctrl_c_in_pairs_is_clean_and_the_next_run_completes(project_copy: MakeP
     project = project_copy()
     arguments = ("pairs", "--db", project.database, "--method", "vlad", "--k", 3)
     before = content(project.folder)
-    interrupted("colmap_netvlad.database:Database.sift_descriptors", *arguments)
+    interrupted("colmap_netvlad.colmap.database:Database.sift_descriptors", *arguments)
     assert_no_leftovers(project.folder)
     assert not project.pairs.exists()
     assert content(project.folder).items() >= before.items()

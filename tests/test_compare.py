@@ -13,14 +13,16 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from colmap_netvlad import metrics
 from colmap_netvlad.cli import cli
-from colmap_netvlad.compare import CompareOptions, compare, models, pipeline, pool, read_json
-from colmap_netvlad.compare.result import Comparison, write_json
+from colmap_netvlad.commands import compare as pipeline
+from colmap_netvlad.commands.compare import CompareOptions, compare
+from colmap_netvlad.compare import models, pool
+from colmap_netvlad.compare.result import Comparison, read_json, write_json
 from colmap_netvlad.compare.workspace import file_name, open_workspace, read_facts
-from colmap_netvlad.errors import EXIT_PARTIAL, InputError
+from colmap_netvlad.graph.verified import correct_pairs, verified_by_name
 from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.project import Project
+from colmap_netvlad.runtime.errors import EXIT_PARTIAL, InputError
 
 METHODS = ("vlad", "random")
 # One thread: COLMAP adds in the order its threads finish, so only that repeats the last digits.
@@ -92,8 +94,8 @@ def test_all_methods_are_compared_and_written(whole):
 
 def test_figures_follow_from_the_matches(whole):
     comparison, folder, _ = whole
-    verified = metrics.verified_by_name(folder / "project-compare" / "work" / "union.db")
-    truth = metrics.correct_pairs(verified)
+    verified = verified_by_name(folder / "project-compare" / "work" / "union.db")
+    truth = correct_pairs(verified)
     exhaustive, vlad, chance = comparison.methods
     assert len(verified) == comparison.pairs_matched == exhaustive.best_k.pairs == 12 * 11 // 2
     assert exhaustive.best_k.recall == 1.0

@@ -5,13 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy import sparse
 
-from colmap_netvlad.connect import (
-    TRIES_PER_LINK,
-    apart_lines,
-    component_names,
-    components,
-    connecting_pairs,
-)
+from colmap_netvlad.graph.components import component_names, components
+from colmap_netvlad.pairs.connect import TRIES_PER_LINK, apart_lines, connecting_pairs
 
 
 def test_components_are_numbered_by_size() -> None:

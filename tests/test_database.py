@@ -13,15 +13,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from schemas import VERSIONS, make_database
 
-from colmap_netvlad.database import (
-    CoordinateSystem,
+from colmap_netvlad.colmap.database import (
     copy_database,
     image_names,
     images_of_pair,
     open_database,
     pair_id,
 )
-from colmap_netvlad.errors import InputError
+from colmap_netvlad.photos.positions import CoordinateSystem
+from colmap_netvlad.runtime.errors import InputError
 
 NAMES = ("a/DJI 0001.JPG", "b/DJI 0001.JPG", "Übersicht.jpg", "图.jpg")
 
@@ -196,7 +196,7 @@ def test_an_empty_file_is_one_sentence(tmp_path: Path) -> None:
 
 
 def test_a_locked_database_is_one_sentence(database: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("colmap_netvlad.database.BUSY_SECONDS", 0.1)
+    monkeypatch.setattr("colmap_netvlad.colmap.database.BUSY_SECONDS", 0.1)
     with closing(sqlite3.connect(database)) as other:
         other.execute("PRAGMA locking_mode = EXCLUSIVE")
         other.execute("BEGIN EXCLUSIVE")

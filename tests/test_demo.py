@@ -13,10 +13,10 @@ import pytest
 from click.testing import CliRunner
 
 from colmap_netvlad.cli import cli
-from colmap_netvlad.database import open_database
+from colmap_netvlad.colmap.database import open_database
+from colmap_netvlad.commands.demo import run_demo
 from colmap_netvlad.demo.check import align, check_against_truth
 from colmap_netvlad.demo.render import Flight, FlightOptions, render_flight, to_wgs84
-from colmap_netvlad.demo.run import run_demo
 
 
 def test_flight_reconstructs_whole_and_within_one_percent(flight: Flight, project_copy, tmp_path):

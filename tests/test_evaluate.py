@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
+from colmap_netvlad.commands.annotate import AnnotateOptions, annotate
 from colmap_netvlad.demo.render import Flight
-from colmap_netvlad.errors import InputError
-from colmap_netvlad.training.annotate import AnnotateOptions, annotate
+from colmap_netvlad.runtime.errors import InputError
 from colmap_netvlad.training.evaluate import evaluate, markdown
 from colmap_netvlad.training.scenes import Scene
 

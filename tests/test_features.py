@@ -11,13 +11,13 @@ from click.testing import CliRunner
 from photos import BROKEN, HEIGHT, SOUND, WIDTH, save_jpeg, scene
 from PIL import Image
 
-from colmap_netvlad import engine
-from colmap_netvlad import features as features_module
 from colmap_netvlad.cli import cli
-from colmap_netvlad.database import ImageRow, open_database
-from colmap_netvlad.errors import EXIT_PARTIAL, InputError
-from colmap_netvlad.features import FeatureOptions, FeatureReport, extract_features
+from colmap_netvlad.colmap import engine
+from colmap_netvlad.colmap import features as features_module
+from colmap_netvlad.colmap.database import ImageRow, open_database
+from colmap_netvlad.colmap.features import FeatureOptions, FeatureReport, extract_features
 from colmap_netvlad.project import find_project
+from colmap_netvlad.runtime.errors import EXIT_PARTIAL, InputError
 
 FEW = {"max_features": 200, "threads": 1}
 

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from colmap_netvlad.errors import InputError
-from colmap_netvlad.files import atomic_path, write_atomically
+from colmap_netvlad.runtime.errors import InputError
+from colmap_netvlad.runtime.files import atomic_path, write_atomically
 
 
 def test_content_replaces_what_was_there(tmp_path: Path) -> None:

@@ -8,15 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import sparse
 
-from colmap_netvlad.errors import InputError
-from colmap_netvlad.retrieval.fusion import (
-    expand,
-    fuse,
-    keep_best,
-    ranking_of,
-    similarity_matrix,
-)
-from colmap_netvlad.retrieval.ranking import NO_PARTNER, Ranking, from_lists
+from colmap_netvlad.cache.ranking import NO_PARTNER, Ranking, from_lists
+from colmap_netvlad.retrieval.fusion import expand, fuse, keep_best, ranking_of, similarity_matrix
+from colmap_netvlad.runtime.errors import InputError
 
 
 def full_ranking(scores: np.ndarray, method: str = "test", depth: int | None = None) -> Ranking:

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy import sparse
 
-from colmap_netvlad.positions import Positions
+from colmap_netvlad.cache.ranking import NO_PARTNER, from_lists
+from colmap_netvlad.photos.positions import Positions
 from colmap_netvlad.retrieval.gps import NEUTRAL, add_nearness, near_first
-from colmap_netvlad.retrieval.ranking import NO_PARTNER, from_lists
 
 
 def on_a_line(*x: float) -> Positions:

@@ -14,15 +14,8 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from photos import BROKEN, HEIGHT, SOUND, WIDTH, save_jpeg, scene
 
-from colmap_netvlad.images import (
-    SIDE_MULTIPLE,
-    BadPhoto,
-    decode_photo,
-    find_photos,
-    load_batches,
-    photo_fingerprint,
-    read_header,
-)
+from colmap_netvlad.photos.decode import SIDE_MULTIPLE, decode_photo, load_batches
+from colmap_netvlad.photos.files import BadPhoto, find_photos, photo_fingerprint, read_header
 
 
 @pytest.fixture

@@ -11,14 +11,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from colmap_netvlad import match_rounds
-from colmap_netvlad.connect import verified_components
-from colmap_netvlad.database import image_names, open_database
-from colmap_netvlad.errors import InputError
-from colmap_netvlad.match_rounds import match_in_rounds, plan_budget
+from colmap_netvlad.cache.ranking import Ranking
+from colmap_netvlad.colmap.database import image_names, open_database
+from colmap_netvlad.graph.verified import verified_components
+from colmap_netvlad.matching import rounds as match_rounds
+from colmap_netvlad.matching.rounds import match_in_rounds, plan_budget
 from colmap_netvlad.project import Project
-from colmap_netvlad.retrieval.methods import RetrievalOptions, rank
-from colmap_netvlad.retrieval.ranking import Ranking
+from colmap_netvlad.retrieval.options import RetrievalOptions
+from colmap_netvlad.retrieval.rank import rank
+from colmap_netvlad.runtime.errors import InputError
 
 
 @pytest.fixture

@@ -15,11 +15,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from colmap_netvlad import engine, matching, workers
-from colmap_netvlad.database import image_names, open_database, pair_id
-from colmap_netvlad.errors import InputError
-from colmap_netvlad.matching import MatchOptions, match_pairs
+from colmap_netvlad.colmap import engine
+from colmap_netvlad.colmap.database import image_names, open_database, pair_id
+from colmap_netvlad.matching import run as matching
+from colmap_netvlad.matching.run import MatchOptions, match_pairs
 from colmap_netvlad.project import Project
+from colmap_netvlad.runtime import workers
+from colmap_netvlad.runtime.errors import InputError
 
 MakeProject = Callable[..., Project]
 

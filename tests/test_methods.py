@@ -12,13 +12,15 @@ import numpy as np
 import pytest
 from schemas import add_images, make_database
 
-from colmap_netvlad.database import image_names, open_database
+from colmap_netvlad.cache.ranking import NO_PARTNER, Ranking
+from colmap_netvlad.colmap.database import image_names, open_database
 from colmap_netvlad.demo.render import Flight
-from colmap_netvlad.errors import InputError
 from colmap_netvlad.project import Project
-from colmap_netvlad.retrieval import bow, methods, vlad
-from colmap_netvlad.retrieval.methods import METHODS, RetrievalOptions, find_method, rank
-from colmap_netvlad.retrieval.ranking import NO_PARTNER, Ranking
+from colmap_netvlad.retrieval import methods
+from colmap_netvlad.retrieval.methods import METHODS, bow, find_method, vlad
+from colmap_netvlad.retrieval.options import RetrievalOptions
+from colmap_netvlad.retrieval.rank import rank
+from colmap_netvlad.runtime.errors import InputError
 
 MakeProject = Callable[..., Project]
 

@@ -11,7 +11,9 @@ from hypothesis import strategies as st
 from sklearn.metrics import average_precision_score
 
 from colmap_netvlad import metrics
-from colmap_netvlad.retrieval.ranking import Ranking, from_lists
+from colmap_netvlad.cache.ranking import Ranking, from_lists
+from colmap_netvlad.graph.pair import as_pair
+from colmap_netvlad.graph.verified import CORRECT_MATCHES, correct_pairs
 
 NAMES = ("a", "b", "c", "d", "e")
 
@@ -23,7 +25,7 @@ def ranking_of(lists: list[list[int]], **times: float) -> Ranking:
 
 def test_sixteen_matches_are_correct_and_fifteen_are_not():
     verified = {("a", "b"): 15, ("a", "c"): 16, ("b", "c"): 0}
-    assert metrics.correct_pairs(verified) == {("a", "c")}
+    assert correct_pairs(verified) == {("a", "c")}
 
 
 def test_accuracy_is_correct_pairs_over_retrieved_pairs():
@@ -85,7 +87,7 @@ def scenes(draw: st.DrawFn) -> tuple[Ranking, set[tuple[str, str]]]:
 
 def pairs_of(ranking: Ranking, k: int) -> set[tuple[str, str]]:
     return {
-        metrics.as_pair(ranking.names[i], ranking.names[j])
+        as_pair(ranking.names[i], ranking.names[j])
         for i, row in enumerate(ranking.top(k).partners.tolist())
         for j in row
     }
@@ -96,7 +98,7 @@ def pairs_of(ranking: Ranking, k: int) -> set[tuple[str, str]]:
 def test_accuracy_times_retrieved_equals_recall_times_truth(scene, k):
     ranking, truth = scene
     retrieved = pairs_of(ranking, k)
-    verified = dict.fromkeys(truth, metrics.CORRECT_MATCHES + 1)
+    verified = dict.fromkeys(truth, CORRECT_MATCHES + 1)
     found_by_accuracy = metrics.accuracy(retrieved, verified) * len(retrieved)
     assert found_by_accuracy == pytest.approx(metrics.recall(retrieved, truth) * len(truth))
 

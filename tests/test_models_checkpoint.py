@@ -8,7 +8,6 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from colmap_netvlad.errors import InputError
 from colmap_netvlad.models import catalogue, describe
 from colmap_netvlad.models.aggregation import NetVLAD, build_aggregation
 from colmap_netvlad.models.backbones import build_trunk
@@ -22,6 +21,7 @@ from colmap_netvlad.models.checkpoint import (
 )
 from colmap_netvlad.models.network import GlobalDescriptor
 from colmap_netvlad.models.whitening import Whitening
+from colmap_netvlad.runtime.errors import InputError
 
 CARD = {"name": "tiny", "long_side": 64, "rotations": 1, "licence": "none"}
 

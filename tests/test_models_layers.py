@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from colmap_netvlad.errors import InputError
 from colmap_netvlad.models.aggregation import (
     ASSIGNMENT_RATIO,
     AdaptedNetVLAD,
@@ -16,6 +15,7 @@ from colmap_netvlad.models.aggregation import (
     build_aggregation,
 )
 from colmap_netvlad.models.whitening import Whitening
+from colmap_netvlad.runtime.errors import InputError
 
 
 def unit(x):

@@ -5,9 +5,9 @@ import pytest
 import torch
 from scipy.io import savemat
 
-from colmap_netvlad.errors import InputError
 from colmap_netvlad.models import netvlad_matlab
 from colmap_netvlad.models.checkpoint import load_model
+from colmap_netvlad.runtime.errors import InputError
 
 CLUSTERS, DIM = 3, 5
 CONVOLUTIONS = {0: (3, 64), 2: (64, 64), 5: (64, 128), 7: (128, 128), 10: (128, 256)}

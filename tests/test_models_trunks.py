@@ -7,7 +7,6 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from colmap_netvlad.errors import InputError
 from colmap_netvlad.models import backbones
 from colmap_netvlad.models.backbones import (
     BACKBONES,
@@ -18,6 +17,7 @@ from colmap_netvlad.models.backbones import (
     timm_lite_key,
 )
 from colmap_netvlad.models.trunk import KERAS_BGR, TORCHVISION_RGB, fold_batch_norm
+from colmap_netvlad.runtime.errors import InputError
 
 SHAPES = {
     "vgg16": (512, 4, 6),

@@ -22,15 +22,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from schemas import VERSIONS, add_images, make_database
 
+from colmap_netvlad.cache.ranking import NO_PARTNER, Ranking
+from colmap_netvlad.cache.store import Store
 from colmap_netvlad.cli import cli
-from colmap_netvlad.database import image_names
-from colmap_netvlad.errors import EXIT_PARTIAL
-from colmap_netvlad.pairs import union_of_top
+from colmap_netvlad.colmap.database import image_names
+from colmap_netvlad.commands.pairs import make_pairs
+from colmap_netvlad.pairs.union import union_of_top
 from colmap_netvlad.project import Project, find_project
-from colmap_netvlad.retrieval.methods import RetrievalOptions
-from colmap_netvlad.retrieval.ranking import NO_PARTNER, Ranking
-from colmap_netvlad.retrieval.run import make_pairs
-from colmap_netvlad.retrieval.store import Store
+from colmap_netvlad.retrieval.options import RetrievalOptions
+from colmap_netvlad.runtime.errors import EXIT_PARTIAL
 
 MakeProject = Callable[..., Project]
 
@@ -76,7 +76,7 @@ def test_pairs_prints_what_it_did_and_the_next_command(project_copy: MakeProject
 def test_pairs_leaves_a_3x_database_byte_identical(
     method: str, legacy_database: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("colmap_netvlad.retrieval.bow.MOST_WORDS", 32)
+    monkeypatch.setattr("colmap_netvlad.retrieval.methods.bow.MOST_WORDS", 32)
     before = sha256(legacy_database)
     result = run("--db", legacy_database, "--k", 3, "--method", method)
     assert result.exit_code == 0, result.output

@@ -15,15 +15,15 @@ import numpy as np
 import pycolmap
 import pytest
 
-from colmap_netvlad.database import images_of_pair
+from colmap_netvlad.colmap.database import images_of_pair
 from colmap_netvlad.demo.simulate import SimulationOptions, simulate_flight
-from colmap_netvlad.errors import InputError
+from colmap_netvlad.graph.viewgraph import read_view_graph
 from colmap_netvlad.mapping import MAPPERS, parallel
 from colmap_netvlad.mapping.incremental import map_incremental
 from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.mapping.partition import Cluster, partition
 from colmap_netvlad.mapping.subset import write_subset
-from colmap_netvlad.viewgraph import read_view_graph
+from colmap_netvlad.runtime.errors import InputError
 
 FLIGHT = SimulationOptions(lines=4, photos=8, features=150, partners=12)
 OPTIONS = MappingOptions(cluster_size=12, threads=2)

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import sparse
 
-from colmap_netvlad.errors import InputError
+from colmap_netvlad.graph.viewgraph import ViewGraph
 from colmap_netvlad.mapping.partition import (
     bisect,
     cut,
@@ -16,7 +16,7 @@ from colmap_netvlad.mapping.partition import (
     normalised_cuts,
     partition,
 )
-from colmap_netvlad.viewgraph import ViewGraph
+from colmap_netvlad.runtime.errors import InputError
 
 
 def view_graph(graph: nx.Graph) -> ViewGraph:

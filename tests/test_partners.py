@@ -6,14 +6,14 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from colmap_netvlad.pairs import ImagePair
-from colmap_netvlad.retrieval.partners import (
+from colmap_netvlad.cache.ranking import NO_PARTNER, Ranking, from_lists
+from colmap_netvlad.pairs.rules import (
     join_pairs,
     sequential_pairs,
     with_camera_quota,
     without_same_frame,
 )
-from colmap_netvlad.retrieval.ranking import NO_PARTNER, Ranking, from_lists
+from colmap_netvlad.pairs.union import ImagePair
 
 
 def ranking_of(rows: list[list[int]]) -> Ranking:

@@ -10,8 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from colmap_netvlad.database import CoordinateSystem, PosePrior
-from colmap_netvlad.positions import place, read_gps
+from colmap_netvlad.photos.positions import CoordinateSystem, PosePrior, place, read_gps
 
 NAMES = [f"DJI_{i:04d}.JPG" for i in range(5)]
 

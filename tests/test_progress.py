@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from colmap_netvlad import progress
+from colmap_netvlad.runtime import progress
 
 
 @pytest.fixture(autouse=True)

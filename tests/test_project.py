@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from colmap_netvlad.errors import InputError
 from colmap_netvlad.project import open_project
+from colmap_netvlad.runtime.errors import InputError
 
 
 @pytest.mark.parametrize("name", ["project.db", "database.db"])

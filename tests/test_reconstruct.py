@@ -15,16 +15,10 @@ import pycolmap
 import pytest
 from click.testing import CliRunner
 
-from colmap_netvlad import engine
 from colmap_netvlad.cli import cli
-from colmap_netvlad.database import image_names
-from colmap_netvlad.errors import InputError
-from colmap_netvlad.mapping.incremental import map_incremental
-from colmap_netvlad.mapping.output import free_output
-from colmap_netvlad.mapping.summary import ModelSummary, combine, registered_names, summarize
-from colmap_netvlad.matching import MatchReport
-from colmap_netvlad.project import Project
-from colmap_netvlad.reconstruct import (
+from colmap_netvlad.colmap import engine
+from colmap_netvlad.colmap.database import image_names
+from colmap_netvlad.commands.reconstruct import (
     ReconstructReport,
     map_and_report,
     reconstruct,
@@ -32,6 +26,12 @@ from colmap_netvlad.reconstruct import (
     report_table,
     working_copy,
 )
+from colmap_netvlad.mapping.incremental import map_incremental
+from colmap_netvlad.mapping.output import free_output
+from colmap_netvlad.mapping.summary import ModelSummary, combine, registered_names, summarize
+from colmap_netvlad.matching.run import MatchReport
+from colmap_netvlad.project import Project
+from colmap_netvlad.runtime.errors import InputError
 
 MakeProject = Callable[..., Project]
 MATCHED = MatchReport(requested=66, already=66, matched=0, verified=50, seconds=0.0)

@@ -19,7 +19,7 @@ from colmap_netvlad.compare.evidence import Plan
 from colmap_netvlad.compare.figures import retrieval_figures
 from colmap_netvlad.compare.finds import single_finds
 from colmap_netvlad.compare.result import MethodResult, ModelFigures, RetrievalFigures
-from colmap_netvlad.metrics import as_pair
+from colmap_netvlad.graph.pair import as_pair
 from colmap_netvlad.report.comparison import print_comparison, write_csv
 from colmap_netvlad.report.examples import choose_examples, hardest_images
 from colmap_netvlad.report.layout import align, from_above, lay_out, similarity

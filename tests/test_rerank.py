@@ -11,13 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from colmap_netvlad.cache.cells import LocalFeatures
+from colmap_netvlad.cache.ranking import NO_PARTNER, Ranking
+from colmap_netvlad.cache.store import Store
 from colmap_netvlad.cli import cli
 from colmap_netvlad.retrieval import rerank as module
-from colmap_netvlad.retrieval.local import LocalFeatures
-from colmap_netvlad.retrieval.methods import RetrievalOptions, rank
-from colmap_netvlad.retrieval.ranking import NO_PARTNER, Ranking
+from colmap_netvlad.retrieval.options import COMPARED, RetrievalOptions
+from colmap_netvlad.retrieval.rank import rank
 from colmap_netvlad.retrieval.rerank import CHANCE, Places, agreeing_matches, rerank
-from colmap_netvlad.retrieval.store import Store
 
 SIDE, STEP, PHOTOS = 12, 4, 9
 """A strip of ground seen by photos of SIDE x SIDE cells, each STEP cells after the one before."""
@@ -235,7 +236,7 @@ def test_deep_methods_compare_unless_told_not_to(project_copy, tiny_checkpoint: 
 def test_the_option_has_the_default_of_the_library() -> None:
     for command in ("pairs", "compare"):
         option = next(p for p in cli.commands[command].params if p.name == "rerank")
-        assert option.default == module.DEPTH == RetrievalOptions().rerank
+        assert option.default == COMPARED == RetrievalOptions().rerank
 
 
 def test_fewer_than_no_candidates_are_refused(project_copy) -> None:

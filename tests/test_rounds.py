@@ -11,16 +11,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import sparse
 
-from colmap_netvlad.metrics import CORRECT_MATCHES
-from colmap_netvlad.retrieval.fusion import similarity_matrix
-from colmap_netvlad.retrieval.ranking import Ranking, from_lists
-from colmap_netvlad.rounds import (
+from colmap_netvlad.cache.ranking import Ranking, from_lists
+from colmap_netvlad.graph.verified import CORRECT_MATCHES
+from colmap_netvlad.pairs.rounds import (
     SATURATION,
     find_candidates,
     next_round,
     split_budget,
     take_turns,
 )
+from colmap_netvlad.retrieval.fusion import similarity_matrix
 
 
 @st.composite

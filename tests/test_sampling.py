@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from colmap_netvlad.errors import InputError
+from colmap_netvlad.runtime.errors import InputError
 from colmap_netvlad.training.augment import (
     Augmentation,
     PseudoOptions,

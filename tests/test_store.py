@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from colmap_netvlad.errors import InputError
+from colmap_netvlad.cache.ranking import from_lists
+from colmap_netvlad.cache.store import Store, remembered_images
 from colmap_netvlad.retrieval.described import missing
-from colmap_netvlad.retrieval.ranking import from_lists
-from colmap_netvlad.retrieval.store import Store, remembered_images
+from colmap_netvlad.runtime.errors import InputError
 
 
 def unit_vectors(count: int, dim: int, seed: int = 0) -> np.ndarray:
@@ -153,7 +153,7 @@ WRITER = """
     import sys
     from pathlib import Path
     import numpy as np
-    from colmap_netvlad.retrieval.store import Store
+    from colmap_netvlad.cache.store import Store
     me = sys.argv[2]
     with Store(Path(sys.argv[1])) as store:
         for batch in range(int(sys.argv[3])):

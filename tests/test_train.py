@@ -14,12 +14,12 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from colmap_netvlad.demo.render import FlightOptions, render_flight
-from colmap_netvlad.errors import InputError
-from colmap_netvlad.images import photo_fingerprint
 from colmap_netvlad.models.aggregation import build_aggregation
 from colmap_netvlad.models.backbones import build_trunk
 from colmap_netvlad.models.checkpoint import load_model, load_network, read_metadata
 from colmap_netvlad.models.network import GlobalDescriptor
+from colmap_netvlad.photos.files import photo_fingerprint
+from colmap_netvlad.runtime.errors import InputError
 from colmap_netvlad.training import history as history_module
 from colmap_netvlad.training import run as run_module
 from colmap_netvlad.training.augment import View

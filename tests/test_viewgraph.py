@@ -13,9 +13,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from colmap_netvlad.cli import cli
-from colmap_netvlad.database import pair_id
-from colmap_netvlad.errors import InputError
-from colmap_netvlad.viewgraph import ViewGraph, edge_weights, hull_area, read_view_graph
+from colmap_netvlad.colmap.database import pair_id
+from colmap_netvlad.graph.viewgraph import ViewGraph, edge_weights, hull_area, read_view_graph
+from colmap_netvlad.runtime.errors import InputError
 
 SQUARE = np.array([[10, 10], [30, 10], [30, 30], [10, 30], [20, 20]], np.float32)
 LINE = np.array([[1, 1], [2, 2], [3, 3], [4, 4], [5, 5]], np.float32)

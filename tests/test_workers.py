@@ -3,9 +3,9 @@
 import os
 from collections.abc import Callable
 
-from colmap_netvlad import workers
-from colmap_netvlad.errors import InputError
-from colmap_netvlad.workers import Job
+from colmap_netvlad.runtime import workers
+from colmap_netvlad.runtime.errors import InputError
+from colmap_netvlad.runtime.workers import Job
 
 
 def succeed(advance: Callable[[int], None], count: int) -> None:

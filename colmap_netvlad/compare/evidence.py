@@ -10,7 +10,7 @@ import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_netvlad.metrics import Pair
+from colmap_netvlad.graph.pair import Pair
 
 
 @dataclass(frozen=True, eq=False)

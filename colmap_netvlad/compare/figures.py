@@ -11,6 +11,7 @@ import networkx as nx
 import pycolmap
 
 from colmap_netvlad import __version__, metrics
+from colmap_netvlad.cache.ranking import Ranking
 from colmap_netvlad.compare import pool
 from colmap_netvlad.compare.evidence import Evidence
 from colmap_netvlad.compare.finds import single_finds
@@ -24,11 +25,11 @@ from colmap_netvlad.compare.result import (
     RetrievalFigures,
 )
 from colmap_netvlad.compare.workspace import ProjectFacts, Workspace
-from colmap_netvlad.machine import usable_processors
-from colmap_netvlad.metrics import Pair
-from colmap_netvlad.positions import read_positions
+from colmap_netvlad.flight import read_positions
+from colmap_netvlad.graph.pair import Pair
+from colmap_netvlad.graph.verified import correct_pairs, verified_by_name
 from colmap_netvlad.project import Project
-from colmap_netvlad.retrieval.ranking import Ranking
+from colmap_netvlad.runtime.machine import usable_processors
 
 FULL_RANKING = 1000
 """Up to this many images every method ranks all others, so that average precision is the
@@ -64,7 +65,7 @@ def gather_evidence(
     Args:
         pairs: by method, its pairs at the largest k.
     """
-    everything = metrics.verified_by_name(workspace.union)
+    everything = verified_by_name(workspace.union)
     if EXHAUSTIVE in pairs:
         verified = everything
     else:
@@ -82,7 +83,7 @@ def gather_evidence(
         partners={c.name: c.ranking.partners for c in candidates if c.ranking and c.ranks},
         pairs=pairs,
         verified=verified,
-        truth=metrics.correct_pairs(verified),
+        truth=correct_pairs(verified),
         positions=read_positions(project).metres,
         plans={name: plan for name, plan in plans.items() if plan is not None},
     )

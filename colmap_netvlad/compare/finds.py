@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 from colmap_netvlad.compare.evidence import Evidence
 from colmap_netvlad.compare.result import CHANCE, EXHAUSTIVE
-from colmap_netvlad.metrics import CORRECT_MATCHES, Pair
+from colmap_netvlad.graph.pair import Pair
+from colmap_netvlad.graph.verified import CORRECT_MATCHES
 
 
 @dataclass(frozen=True)

@@ -14,14 +14,14 @@ from pathlib import Path
 
 import numpy as np
 
+from colmap_netvlad.colmap.database import open_database, pair_id
 from colmap_netvlad.compare.evidence import Plan
 from colmap_netvlad.compare.result import ModelFigures
-from colmap_netvlad.database import open_database, pair_id
-from colmap_netvlad.files import atomic_path, write_atomically
+from colmap_netvlad.graph.pair import Pair
 from colmap_netvlad.mapping.incremental import map_incremental
 from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.mapping.summary import summarize
-from colmap_netvlad.metrics import Pair
+from colmap_netvlad.runtime.files import atomic_path, write_atomically
 
 MATCH_TABLES = ("matches", "two_view_geometries")
 

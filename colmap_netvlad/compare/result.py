@@ -8,8 +8,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from colmap_netvlad.errors import InputError
-from colmap_netvlad.files import write_atomically
+from colmap_netvlad.runtime.errors import InputError
+from colmap_netvlad.runtime.files import write_atomically
 
 FORMAT = 2
 """Version of `compare.json`."""

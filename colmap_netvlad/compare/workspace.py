@@ -22,11 +22,11 @@ from pathlib import Path
 
 import numpy as np
 
-from colmap_netvlad.database import copy_database, open_database
-from colmap_netvlad.errors import InputError
-from colmap_netvlad.files import atomic_path, write_atomically
-from colmap_netvlad.metrics import Pair
-from colmap_netvlad.retrieval.ranking import Ranking
+from colmap_netvlad.cache.ranking import Ranking
+from colmap_netvlad.colmap.database import copy_database, open_database
+from colmap_netvlad.graph.pair import Pair
+from colmap_netvlad.runtime.errors import InputError
+from colmap_netvlad.runtime.files import atomic_path, write_atomically
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from matplotlib import image as photos
 from matplotlib.figure import Figure, SubFigure
 
 from colmap_netvlad.demo.render import Flight
-from colmap_netvlad.files import atomic_path
+from colmap_netvlad.runtime.files import atomic_path
 
 SAMPLES = 6
 """Photos shown."""

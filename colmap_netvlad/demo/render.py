@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from colmap_netvlad.demo.exif import Exif, add_exif
 from colmap_netvlad.demo.landscape import Extent, Ground, Landscape
-from colmap_netvlad.errors import InputError
-from colmap_netvlad.files import write_atomically
-from colmap_netvlad.progress import step
+from colmap_netvlad.runtime.errors import InputError
+from colmap_netvlad.runtime.files import write_atomically
+from colmap_netvlad.runtime.progress import step
 
 Heights = NDArray[np.float32] | np.float32
 

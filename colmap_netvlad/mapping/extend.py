@@ -6,11 +6,12 @@ from pathlib import Path
 
 import pycolmap
 
-from colmap_netvlad import engine, progress
-from colmap_netvlad.errors import InputError
+from colmap_netvlad.colmap import engine
 from colmap_netvlad.mapping.incremental import pipeline_options
 from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.mapping.output import model_folder
+from colmap_netvlad.runtime import progress
+from colmap_netvlad.runtime.errors import InputError
 
 
 def read_model(folder: Path) -> pycolmap.Reconstruction:

@@ -6,10 +6,11 @@ from pathlib import Path
 
 import pycolmap
 
-from colmap_netvlad import engine, progress
-from colmap_netvlad.database import open_database
+from colmap_netvlad.colmap import engine
+from colmap_netvlad.colmap.database import open_database
 from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.mapping.output import model_folder
+from colmap_netvlad.runtime import progress
 
 
 def map_incremental(

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from colmap_netvlad.errors import InputError
+from colmap_netvlad.runtime.errors import InputError
 
 
 @contextmanager

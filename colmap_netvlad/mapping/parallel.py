@@ -19,10 +19,7 @@ from pathlib import Path
 
 import pycolmap
 
-from colmap_netvlad import progress, workers
-from colmap_netvlad.errors import InputError
-from colmap_netvlad.files import write_atomically
-from colmap_netvlad.machine import usable_processors
+from colmap_netvlad.graph.viewgraph import ViewGraph, read_view_graph
 from colmap_netvlad.mapping.incremental import pipeline_options
 from colmap_netvlad.mapping.merge import merge, read_sub_model
 from colmap_netvlad.mapping.options import MappingOptions
@@ -30,7 +27,10 @@ from colmap_netvlad.mapping.output import model_folder
 from colmap_netvlad.mapping.partition import Cluster, partition
 from colmap_netvlad.mapping.refine import load_cache, rebuild, refine
 from colmap_netvlad.mapping.subset import write_subset
-from colmap_netvlad.viewgraph import ViewGraph, read_view_graph
+from colmap_netvlad.runtime import progress, workers
+from colmap_netvlad.runtime.errors import InputError
+from colmap_netvlad.runtime.files import write_atomically
+from colmap_netvlad.runtime.machine import usable_processors
 
 CLUSTER_IMAGES = 250
 """Default size of a cluster before it is expanded (measured, see docs/parallel-sfm.md)."""
@@ -363,7 +363,7 @@ def worker_count(database: Path, largest: int, jobs: int, options: MappingOption
 
 
 def _image_count(database: Path) -> int:
-    from colmap_netvlad.database import open_database
+    from colmap_netvlad.colmap.database import open_database
 
     with open_database(database) as opened:
         return len(opened.images())

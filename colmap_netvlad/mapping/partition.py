@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, sparse
 
-from colmap_netvlad.errors import InputError
-from colmap_netvlad.viewgraph import ViewGraph
+from colmap_netvlad.graph.viewgraph import ViewGraph
+from colmap_netvlad.runtime.errors import InputError
 
 MIN_SIDE = 1 / 3
 """A bisection leaves each side at least this share of the images: balanced clusters."""

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pycolmap
 
-from colmap_netvlad import progress, workers
-from colmap_netvlad.database import open_database
-from colmap_netvlad.errors import InputError
+from colmap_netvlad.colmap.database import open_database
 from colmap_netvlad.mapping.incremental import map_incremental, pipeline_options
 from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.mapping.output import model_folder
 from colmap_netvlad.mapping.parallel import CLUSTER_IMAGES, map_parallel
+from colmap_netvlad.runtime import progress, workers
+from colmap_netvlad.runtime.errors import InputError
 
 PARALLEL_IMAGES = 500
 """From this many images with features on, parallel mapping is chosen (measured, see

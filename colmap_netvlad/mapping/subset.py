@@ -11,8 +11,8 @@ from collections.abc import Iterable, Sequence
 from contextlib import closing
 from pathlib import Path
 
-from colmap_netvlad.database import Database, open_database, pair_id
-from colmap_netvlad.files import atomic_path
+from colmap_netvlad.colmap.database import Database, open_database, pair_id
+from colmap_netvlad.runtime.files import atomic_path
 
 COPIED_WHOLE = ("cameras", "rigs", "rig_sensors")
 """Small tables that every subset needs."""

@@ -11,7 +11,6 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from colmap_netvlad.errors import InputError
 from colmap_netvlad.models.efficientnet_lite import EfficientNetLite0
 from colmap_netvlad.models.resnet import ResNet50
 from colmap_netvlad.models.trunk import (
@@ -22,6 +21,7 @@ from colmap_netvlad.models.trunk import (
     Trunk,
 )
 from colmap_netvlad.models.vgg import VGG16
+from colmap_netvlad.runtime.errors import InputError
 
 
 def same_key(key: str) -> str:

@@ -6,7 +6,7 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
-from colmap_netvlad.errors import InputError
+from colmap_netvlad.runtime.errors import InputError
 
 SHIPPED = Path(__file__).parent / "weights"
 """The checkpoints that come with the package."""

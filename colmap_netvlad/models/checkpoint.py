@@ -12,8 +12,6 @@ from safetensors.torch import save
 from torch import Tensor
 
 from colmap_netvlad import __version__
-from colmap_netvlad.errors import InputError
-from colmap_netvlad.files import write_atomically
 from colmap_netvlad.models.aggregation import AGGREGATIONS, build_aggregation
 from colmap_netvlad.models.backbones import build_trunk
 from colmap_netvlad.models.catalogue import CATALOGUE
@@ -21,6 +19,8 @@ from colmap_netvlad.models.describe import DescriptorModel
 from colmap_netvlad.models.network import GlobalDescriptor
 from colmap_netvlad.models.trunk import Normalisation
 from colmap_netvlad.models.whitening import Whitening
+from colmap_netvlad.runtime.errors import InputError
+from colmap_netvlad.runtime.files import write_atomically
 
 METADATA_KEY = "colmap-netvlad"
 FORMAT_VERSION = 1

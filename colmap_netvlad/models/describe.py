@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from colmap_netvlad.errors import InputError
 from colmap_netvlad.models.network import GlobalDescriptor
 from colmap_netvlad.models.trunk import Trunk, fold_batch_norm
+from colmap_netvlad.runtime.errors import InputError
 
 
 def choose_device(name: str | None = None) -> torch.device:

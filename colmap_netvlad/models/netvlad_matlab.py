@@ -17,12 +17,12 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from colmap_netvlad.errors import InputError
 from colmap_netvlad.models.aggregation import NetVLAD
 from colmap_netvlad.models.network import GlobalDescriptor
 from colmap_netvlad.models.trunk import Normalisation
 from colmap_netvlad.models.vgg import VGG16
 from colmap_netvlad.models.whitening import Whitening
+from colmap_netvlad.runtime.errors import InputError
 
 VLAD_LAYER, WHITENING_LAYER = 30, 33
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from colmap_netvlad.errors import InputError
+from colmap_netvlad.runtime.errors import InputError
 
 
 class Whitening(nn.Module):

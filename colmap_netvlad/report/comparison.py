@@ -10,8 +10,8 @@ from rich.console import Console
 from rich.table import Table
 
 from colmap_netvlad.compare.result import EXHAUSTIVE, Comparison, MethodResult
-from colmap_netvlad.files import write_atomically
 from colmap_netvlad.report.measures import MEASURES, NOT_RUNNING, shown
+from colmap_netvlad.runtime.files import write_atomically
 
 BEST = "*"
 """Marks the best of a row."""

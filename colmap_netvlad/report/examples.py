@@ -12,10 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_netvlad.cache.ranking import NO_PARTNER
 from colmap_netvlad.compare.evidence import Evidence
 from colmap_netvlad.compare.result import CHANCE
-from colmap_netvlad.metrics import CORRECT_MATCHES, Pair, as_pair
-from colmap_netvlad.retrieval.ranking import NO_PARTNER
+from colmap_netvlad.graph.pair import Pair, as_pair
+from colmap_netvlad.graph.verified import CORRECT_MATCHES
 
 QUERIES = 3
 """Queries shown."""

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from colmap_netvlad.compare.evidence import Evidence, Plan
-from colmap_netvlad.metrics import Pair
+from colmap_netvlad.graph.pair import Pair
 
 LEAST_SPREAD = 0.02
 """Points on a line to within this share of its length do not fix a rotation."""

@@ -15,15 +15,11 @@ from colmap_netvlad.compare.evidence import Evidence
 from colmap_netvlad.compare.figures import FULL_RANKING
 from colmap_netvlad.compare.finds import single_finds
 from colmap_netvlad.compare.result import Comparison
-from colmap_netvlad.metrics import CORRECT_MATCHES, Pair, as_pair
+from colmap_netvlad.graph.pair import Pair, as_pair
+from colmap_netvlad.graph.verified import CORRECT_MATCHES
 from colmap_netvlad.report import plots
 from colmap_netvlad.report.comparison import notes_of, reference_sentence
-from colmap_netvlad.report.examples import (
-    FINDS,
-    PARTNERS,
-    choose_examples,
-    hardest_images,
-)
+from colmap_netvlad.report.examples import FINDS, PARTNERS, choose_examples, hardest_images
 from colmap_netvlad.report.layout import Layout, align, lay_out
 from colmap_netvlad.report.measures import NOT_RUNNING, count, percent, seconds, shown
 from colmap_netvlad.report.thumbnails import Thumbnails, data_uri

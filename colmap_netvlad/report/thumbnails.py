@@ -7,7 +7,8 @@ from pathlib import Path
 
 import cv2
 
-from colmap_netvlad.images import BadPhoto, decode_photo
+from colmap_netvlad.photos.decode import decode_photo
+from colmap_netvlad.photos.files import BadPhoto
 
 LONG_SIDE = 208
 """Of a thumbnail, px: sharp on screens of twice the density at the size the page shows."""

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from colmap_netvlad.retrieval.ranking import NO_PARTNER, Ranking
+from colmap_netvlad.cache.ranking import NO_PARTNER, Ranking
+from colmap_netvlad.cache.store import Store
 from colmap_netvlad.retrieval.search import nearest
-from colmap_netvlad.retrieval.store import Store
 
 if TYPE_CHECKING:
-    from colmap_netvlad.retrieval.methods import RetrievalOptions
+    from colmap_netvlad.retrieval.options import RetrievalOptions
 
 
 def missing(store: Store, model: str, photos: Mapping[str, str], local: bool = False) -> list[str]:

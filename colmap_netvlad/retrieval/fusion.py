@@ -12,8 +12,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from scipy import sparse
 
-from colmap_netvlad.errors import InputError
-from colmap_netvlad.retrieval.ranking import NO_PARTNER, Ranking
+from colmap_netvlad.cache.ranking import NO_PARTNER, Ranking
+from colmap_netvlad.runtime.errors import InputError
 
 BLOCK_ROWS = 1024
 """Rows of a sparse product that are in memory at once."""

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.spatial import cKDTree
 
-from colmap_netvlad.positions import Positions
+from colmap_netvlad.cache.ranking import Ranking
+from colmap_netvlad.photos.positions import Positions
 from colmap_netvlad.retrieval.fusion import ranking_of, similarity_matrix
-from colmap_netvlad.retrieval.ranking import Ranking
 
 NEUTRAL = 0.5
 """Nearness of a pair of which a position is unknown: it neither gains nor loses."""

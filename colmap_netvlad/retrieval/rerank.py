@@ -24,15 +24,13 @@ from numpy.typing import NDArray
 from scipy import sparse
 from threadpoolctl import threadpool_limits
 
-from colmap_netvlad.machine import usable_processors
-from colmap_netvlad.progress import step
+from colmap_netvlad.cache.cells import LocalFeatures
+from colmap_netvlad.cache.ranking import NO_PARTNER, Ranking
+from colmap_netvlad.cache.store import Store
 from colmap_netvlad.retrieval.fusion import expand, keep_best, ranking_of
-from colmap_netvlad.retrieval.local import LocalFeatures
-from colmap_netvlad.retrieval.ranking import NO_PARTNER, Ranking
-from colmap_netvlad.retrieval.store import Store
-
-DEPTH = 100
-"""Candidates of each image that are compared."""
+from colmap_netvlad.retrieval.options import COMPARED
+from colmap_netvlad.runtime.machine import usable_processors
+from colmap_netvlad.runtime.progress import step
 
 TOLERANCE = 1.25
 """How far from the common transform a match may lie, cells."""
@@ -60,7 +58,7 @@ KEEP_PAIRS = 2000
 Pairs = NDArray[np.intp]
 
 
-def rerank(candidates: Ranking, store: Store, model: str, k: int, depth: int = DEPTH) -> Ranking:
+def rerank(candidates: Ranking, store: Store, model: str, k: int, depth: int = COMPARED) -> Ranking:
     """Return each image's `k` best partners, `depth` candidates compared place by place.
 
     The first half are its best candidates; what these teach chooses the others, so that a

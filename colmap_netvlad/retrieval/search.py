@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_netvlad.progress import step
+from colmap_netvlad.runtime.progress import step
 
 EXACT_UP_TO = 20_000
 """Exact search up to this number of images, HNSW above. `benchmarks/search_scale.py --switch`

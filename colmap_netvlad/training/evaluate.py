@@ -7,10 +7,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from colmap_netvlad.database import copy_database
-from colmap_netvlad.errors import InputError
+from colmap_netvlad.colmap.database import copy_database
 from colmap_netvlad.project import Project
-from colmap_netvlad.retrieval.methods import RetrievalOptions, rank
+from colmap_netvlad.retrieval.options import RetrievalOptions
+from colmap_netvlad.retrieval.rank import rank
+from colmap_netvlad.runtime.errors import InputError
 from colmap_netvlad.training.scenes import Scene
 from colmap_netvlad.training.validate import Score, mean_score, score
 

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from colmap_netvlad.files import atomic_path, write_atomically
+from colmap_netvlad.runtime.files import atomic_path, write_atomically
 from colmap_netvlad.training.validate import Score, mean_score
 
 

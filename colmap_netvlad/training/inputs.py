@@ -18,9 +18,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from colmap_netvlad.errors import InputError
-from colmap_netvlad.images import SIDE_MULTIPLE, BadPhoto, decode_photo
-from colmap_netvlad.progress import step
+from colmap_netvlad.photos.decode import SIDE_MULTIPLE, decode_photo
+from colmap_netvlad.photos.files import BadPhoto
+from colmap_netvlad.runtime.errors import InputError
+from colmap_netvlad.runtime.progress import step
 from colmap_netvlad.training.augment import View, draw_view, render
 from colmap_netvlad.training.options import TrainOptions
 from colmap_netvlad.training.sampling import Batch

@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
-from colmap_netvlad.errors import InputError
+from colmap_netvlad.runtime.errors import InputError
 from colmap_netvlad.training.augment import Augmentation, PseudoOptions
 from colmap_netvlad.training.losses import LOSSES, LossOptions
 from colmap_netvlad.training.sampling import MINING, NEGATIVES, SamplingOptions

@@ -28,14 +28,14 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from colmap_netvlad import progress
-from colmap_netvlad.errors import InputError
-from colmap_netvlad.files import atomic_path
 from colmap_netvlad.models.aggregation import NetVLAD, build_aggregation
 from colmap_netvlad.models.backbones import load_trunk
 from colmap_netvlad.models.checkpoint import load_model, load_network, save_checkpoint
 from colmap_netvlad.models.describe import choose_device
 from colmap_netvlad.models.network import GlobalDescriptor
+from colmap_netvlad.runtime import progress
+from colmap_netvlad.runtime.errors import InputError
+from colmap_netvlad.runtime.files import atomic_path
 from colmap_netvlad.training.augment import pseudo_scene
 from colmap_netvlad.training.correspondences import correspondence_loss, draw_correspondences
 from colmap_netvlad.training.history import Epoch, write_history

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_netvlad.errors import InputError
+from colmap_netvlad.runtime.errors import InputError
 from colmap_netvlad.training.scenes import Scene
 
 MINING = ("nontrivial", "global", "flight")

@@ -34,9 +34,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from colmap_netvlad.errors import InputError
-from colmap_netvlad.files import write_atomically
-from colmap_netvlad.metrics import CORRECT_MATCHES, Pair, as_pair
+from colmap_netvlad.graph.pair import Pair, as_pair
+from colmap_netvlad.graph.verified import CORRECT_MATCHES
+from colmap_netvlad.runtime.errors import InputError
+from colmap_netvlad.runtime.files import write_atomically
 
 FORMAT = "colmap-netvlad annotation"
 VERSION = 1

@@ -9,13 +9,13 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from colmap_netvlad.errors import InputError
 from colmap_netvlad.models.describe import choose_precision
 from colmap_netvlad.models.efficientnet_lite import EfficientNetLite0
 from colmap_netvlad.models.network import GlobalDescriptor
 from colmap_netvlad.models.resnet import ResNet50
 from colmap_netvlad.models.trunk import Trunk
 from colmap_netvlad.models.vgg import VGG16
+from colmap_netvlad.runtime.errors import InputError
 
 
 def _vgg_stages(trunk: VGG16) -> dict[str, nn.Module]:

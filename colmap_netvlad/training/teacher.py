@@ -10,9 +10,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from colmap_netvlad.files import atomic_path
 from colmap_netvlad.models.describe import DescriptorModel
-from colmap_netvlad.progress import step
+from colmap_netvlad.runtime.files import atomic_path
+from colmap_netvlad.runtime.progress import step
 from colmap_netvlad.training.inputs import Photos, fingerprint_of_photos
 
 

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
-from colmap_netvlad.database import open_database
-from colmap_netvlad.metrics import CORRECT_MATCHES
+from colmap_netvlad.colmap.database import open_database
+from colmap_netvlad.graph.verified import CORRECT_MATCHES
 from colmap_netvlad.training.scenes import Observations
 
 

@@ -12,13 +12,13 @@ import torch
 from numpy.typing import NDArray
 from torch.nn import functional
 
-from colmap_netvlad.errors import InputError
-from colmap_netvlad.files import atomic_path
-from colmap_netvlad.images import load_batches
+from colmap_netvlad.cache.ranking import Ranking
 from colmap_netvlad.metrics import accuracy, mean_average_precision
-from colmap_netvlad.pairs import union_of_top
-from colmap_netvlad.progress import step
-from colmap_netvlad.retrieval.ranking import Ranking
+from colmap_netvlad.pairs.union import union_of_top
+from colmap_netvlad.photos.decode import load_batches
+from colmap_netvlad.runtime.errors import InputError
+from colmap_netvlad.runtime.files import atomic_path
+from colmap_netvlad.runtime.progress import step
 from colmap_netvlad.training.inputs import fingerprint_of_photos
 from colmap_netvlad.training.scenes import Scene
 from colmap_netvlad.training.stages import SplitNetwork

@@ -1,0 +1,1 @@
+"""What is kept beside the database, so that nothing is computed twice."""

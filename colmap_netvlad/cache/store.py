@@ -1,0 +1,434 @@
+"""The cache beside the database: descriptors, local features, rankings, settings, in one file.
+
+Descriptors are kept by image name, content fingerprint of the photo and fingerprint of the
+model, so that a second run computes nothing, ten new photos cost ten photos, and a photo
+changed on disk is described again. Every batch is one transaction: a killed run goes on where
+it stopped, and two processes at once wait for each other instead of losing rows.
+
+Vectors are kept as float16: half the space, and for L2-normalised vectors of up to 32,768
+values the inner product changes by less than 5e-4 (a test), below what tells neighbours apart.
+"""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from types import TracebackType
+
+import numpy as np
+import sqlite_utils
+from numpy.typing import NDArray
+
+from colmap_netvlad.cache.cells import LocalFeatures
+from colmap_netvlad.cache.ranking import NO_PARTNER, Ranking, from_lists
+from colmap_netvlad.runtime.errors import InputError
+
+FORMAT = 1
+"""Version of the tables below, kept in `PRAGMA user_version`."""
+
+APPLICATION = 0x4E56_4C44
+"""`PRAGMA application_id` that marks the file as ours ("NVLD")."""
+
+BUSY_SECONDS = 60.0
+"""How long one process waits for another's transaction."""
+
+IMAGES_SETTING = "images"
+"""The photo folder: absolute, or relative to the cache where it lies below it."""
+
+
+class Store:
+    """The cache file of a project; made when it is not there. Use it as a context manager.
+
+    Raises:
+        InputError: the file is damaged, of another version, not a cache, or cannot be written.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        with self._faults():
+            connection = sqlite3.connect(path, timeout=BUSY_SECONDS, isolation_level=None)
+            self._db = sqlite_utils.Database(connection)
+            try:
+                self._open()
+            except BaseException:
+                self.close()
+                raise
+
+    def __enter__(self) -> Store:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        fault: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._db.conn.close()
+
+    # Descriptors
+
+    def described(self, model: str) -> dict[str, str]:
+        """Return the photo's fingerprint by image name, of all images described by a model."""
+        with self._faults():
+            rows = self._db.execute("SELECT image, photo FROM descriptors WHERE model = ?", [model])
+            return dict(rows.fetchall())
+
+    def add_descriptors(
+        self,
+        model: str,
+        names: Sequence[str],
+        photos: Sequence[str],
+        vectors: NDArray[np.floating],
+        seconds: float,
+        local: Sequence[LocalFeatures] = (),
+    ) -> None:
+        """Keep a batch of descriptors in one transaction; older ones of these images go.
+
+        Args:
+            model: the model's fingerprint.
+            names: B image names.
+            photos: B fingerprints of the photos the vectors were computed from.
+            vectors: (B, D) descriptors, L2-normalised.
+            seconds: what describing the batch took, s.
+            local: B photos' local features, or none of them.
+        """
+        share = seconds / max(len(names), 1)
+        rows = (
+            {
+                "model": model,
+                "image": name,
+                "photo": photo,
+                "seconds": share,
+                "vector": np.ascontiguousarray(vector, np.float16).tobytes(),
+            }
+            for name, photo, vector in zip(names, photos, vectors, strict=True)
+        )
+        codes = (
+            {
+                "model": model,
+                "image": name,
+                "photo": photo,
+                "height": features.codes.shape[0],
+                "width": features.codes.shape[1],
+                "codes": features.codes.tobytes(),
+            }
+            for name, photo, features in zip(names, photos, local, strict=False)
+        )
+        with self._transaction():
+            self._db["descriptors"].insert_all(rows, replace=True)
+            self._db["local_features"].insert_all(codes, replace=True)
+
+    def seconds(self, model: str, names: Iterable[str]) -> float:
+        """Return what describing these images took when it was done, s."""
+        with self._faults():
+            rows = self._db.execute(
+                "SELECT image, seconds FROM descriptors WHERE model = ?", [model]
+            )
+            spent = dict(rows.fetchall())
+        return sum(spent[name] for name in names)
+
+    def vectors(self, model: str, names: Sequence[str]) -> StoredVectors:
+        """Return the descriptors of these images as rows that are read when they are sliced."""
+        return StoredVectors(self, model, tuple(names))
+
+    def read_vectors(self, model: str, names: Sequence[str]) -> NDArray[np.float16]:
+        """Return (B, D) descriptors of these images.
+
+        Raises:
+            KeyError: one of them is not described.
+        """
+        query = "SELECT vector FROM descriptors WHERE model = ? AND image = ?"
+        blobs = []
+        with self._faults():
+            for name in names:
+                row = self._db.execute(query, [model, name]).fetchone()
+                if row is None:
+                    raise KeyError(name)
+                blobs.append(row[0])
+        return np.frombuffer(b"".join(blobs), np.float16).reshape(len(blobs), -1)
+
+    # Local features
+
+    def described_locally(self, model: str) -> dict[str, str]:
+        """Return the photo's fingerprint by image name, of all images with local features."""
+        with self._faults():
+            rows = self._db.execute(
+                "SELECT image, photo FROM local_features WHERE model = ?", [model]
+            )
+            return dict(rows.fetchall())
+
+    def local_numbers(self, model: str) -> dict[str, int]:
+        """Return the number of each image's local features, by image name.
+
+        A number is never given again: features of a changed photo have another one.
+        """
+        with self._faults():
+            rows = self._db.execute(
+                "SELECT image, number FROM local_features WHERE model = ?", [model]
+            )
+            return dict(rows.fetchall())
+
+    def read_local(self, number: int) -> LocalFeatures:
+        """Return the local features of that number.
+
+        Raises:
+            KeyError: there are none.
+        """
+        with self._faults():
+            row = self._db.execute(
+                "SELECT height, width, codes FROM local_features WHERE number = ?", [number]
+            ).fetchone()
+        if row is None:
+            raise KeyError(number)
+        height, width, codes = row
+        return LocalFeatures(np.frombuffer(codes, np.int8).reshape(height, width, -1))
+
+    def agreements(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+        """Return what was counted so far, in the order of the numbers.
+
+        Returns:
+            (M, 2) numbers of two local features, lower first; (M,) their agreeing matches;
+            (M,) what counting them took, s.
+        """
+        row = np.dtype([("pair", np.int64, 2), ("matches", np.int64), ("seconds", np.float64)])
+        with self._faults():
+            found = self._db.execute(
+                "SELECT first, second, matches, seconds FROM agreements ORDER BY first, second"
+            )
+            # Row by row: 20,000 images have a million pairs.
+            table = np.fromiter((((a, b), count, spent) for a, b, count, spent in found), row)
+        return table["pair"], table["matches"], table["seconds"]
+
+    def add_agreements(self, rows: Iterable[tuple[int, int, int, float]]) -> None:
+        """Keep (first, second, matches, seconds) of compared pairs in one transaction."""
+        with self._transaction():
+            self._db.conn.executemany("INSERT OR REPLACE INTO agreements VALUES (?, ?, ?, ?)", rows)
+
+    # Rankings
+
+    def save_ranking(self, ranking: Ranking, model: str = "") -> None:
+        """Keep every image's partners with rank (from 1) and score; the method's older one goes.
+
+        Args:
+            ranking: what to keep.
+            model: fingerprint of the model, where the method has one.
+        """
+        rows = (
+            {
+                "method": ranking.method,
+                "model": model,
+                "image": name,
+                "rank": rank,
+                "partner": ranking.names[j],
+                "score": score,
+            }
+            for name, partners, scores in zip(
+                ranking.names, ranking.partners.tolist(), ranking.scores.tolist(), strict=True
+            )
+            for rank, (j, score) in enumerate(zip(partners, scores, strict=True), start=1)
+            if j != NO_PARTNER
+        )
+        with self._transaction():
+            self._db.execute("DELETE FROM rankings WHERE method = ?", [ranking.method])
+            self._db["rankings"].insert_all(rows)
+
+    def load_ranking(self, method: str, names: Sequence[str]) -> Ranking | None:
+        """Return the kept ranking of a method over `names`, or None where there is none.
+
+        Images that the kept ranking does not know have no partners, partners that are not in
+        `names` are dropped.
+        """
+        index = {name: i for i, name in enumerate(names)}
+        lists: list[list[tuple[int, float]]] = [[] for _ in names]
+        with self._faults():
+            rows = self._db.execute(
+                "SELECT image, partner, score FROM rankings WHERE method = ? ORDER BY image, rank",
+                [method],
+            ).fetchall()
+        for image, partner, score in rows:
+            if image in index and partner in index:
+                lists[index[image]].append((index[partner], score))
+        return from_lists(tuple(names), lists, method) if rows else None
+
+    # Codebooks
+
+    def codebook(self, key: str) -> tuple[NDArray[np.float32], int] | None:
+        """Return (words, number of images they were learned on), or None."""
+        with self._faults():
+            row = self._db.execute(
+                "SELECT words, dim, images FROM codebooks WHERE key = ?", [key]
+            ).fetchone()
+        if row is None:
+            return None
+        return np.frombuffer(row[0], np.float32).reshape(-1, row[1]), row[2]
+
+    def keep_codebook(self, key: str, words: NDArray[np.float32], images: int) -> None:
+        """Keep (K, dim) words learned on `images` images."""
+        row = {"key": key, "images": images, "dim": words.shape[1], "words": words.tobytes()}
+        with self._transaction():
+            self._db["codebooks"].insert(row, replace=True)
+
+    # Settings
+
+    def setting(self, key: str) -> str | None:
+        """Return a remembered value, or None."""
+        with self._faults():
+            row = self._db.execute("SELECT value FROM settings WHERE key = ?", [key]).fetchone()
+        return None if row is None else row[0]
+
+    def remember(self, key: str, value: str) -> None:
+        """Remember a value under a key; writes only where it differs."""
+        if self.setting(key) != value:
+            with self._transaction():
+                self._db["settings"].insert({"key": key, "value": value}, replace=True)
+
+    # The file
+
+    def remember_images(self, folder: Path) -> None:
+        """Keep the photo folder; as part of the workspace it moves with it."""
+        folder, base = folder.resolve(), self.path.parent.resolve()
+        inside = folder.is_relative_to(base)
+        self.remember(IMAGES_SETTING, os.path.relpath(folder, base) if inside else str(folder))
+
+    def _open(self) -> None:
+        application = self._pragma("application_id")
+        tables = self._pragma("schema_version")
+        if application != APPLICATION and tables:
+            raise InputError(
+                f"{self.path} is not a cache of colmap-netvlad; name another file with --cache."
+            )
+        version = self._pragma("user_version")
+        if tables and version != FORMAT:
+            raise InputError(
+                f"The cache {self.path} has format {version}, this version of colmap-netvlad reads "
+                f"format {FORMAT}; delete the file (it is made again), or name another with "
+                "--cache."
+            )
+        if not tables:
+            self._create()
+        elif "agreements" not in self._db.table_names():  # the cache of an older version
+            with self._transaction():
+                self._create_local()
+
+    def _create(self) -> None:
+        # Large pages: a descriptor of 64 KiB then lies in few of them.
+        self._db.execute("PRAGMA page_size = 32768")
+        self._db.execute("PRAGMA journal_mode = WAL")
+        with self._transaction():
+            self._db["descriptors"].create(
+                {"model": str, "image": str, "photo": str, "seconds": float, "vector": bytes},
+                pk=("model", "image"),
+                not_null={"photo", "seconds", "vector"},
+                if_not_exists=True,
+            )
+            self._db["rankings"].create(
+                {
+                    "method": str,
+                    "model": str,
+                    "image": str,
+                    "rank": int,
+                    "partner": str,
+                    "score": float,
+                },
+                pk=("method", "image", "rank"),
+                if_not_exists=True,
+            )
+            self._db["codebooks"].create(
+                {"key": str, "images": int, "dim": int, "words": bytes},
+                pk="key",
+                if_not_exists=True,
+            )
+            self._db["settings"].create({"key": str, "value": str}, pk="key", if_not_exists=True)
+            self._create_local()
+            self._db.execute(f"PRAGMA application_id = {APPLICATION}")
+            self._db.execute(f"PRAGMA user_version = {FORMAT}")
+
+    def _create_local(self) -> None:
+        # AUTOINCREMENT: the number of features that are gone is not given again.
+        self._db.execute(
+            "CREATE TABLE IF NOT EXISTS local_features (number INTEGER PRIMARY KEY AUTOINCREMENT,"
+            " model TEXT NOT NULL, image TEXT NOT NULL, photo TEXT NOT NULL,"
+            " height INTEGER NOT NULL, width INTEGER NOT NULL, codes BLOB NOT NULL,"
+            " UNIQUE (model, image))"
+        )
+        self._db.execute(
+            "CREATE TABLE IF NOT EXISTS agreements (first INTEGER, second INTEGER,"
+            " matches INTEGER NOT NULL, seconds REAL NOT NULL, PRIMARY KEY (first, second))"
+            " WITHOUT ROWID"
+        )
+
+    def _pragma(self, name: str) -> int:
+        return int(self._db.execute(f"PRAGMA {name}").fetchone()[0])
+
+    @contextmanager
+    def _transaction(self) -> Iterator[None]:
+        with self._faults():
+            self._db.execute("BEGIN IMMEDIATE")
+            try:
+                yield
+                self._db.execute("COMMIT")
+            except BaseException:
+                if self._db.conn.in_transaction:
+                    self._db.execute("ROLLBACK")
+                raise
+
+    @contextmanager
+    def _faults(self) -> Iterator[None]:
+        try:
+            yield
+        except sqlite3.OperationalError as fault:
+            raise InputError(_sentence(self.path, str(fault))) from fault
+        except sqlite3.DatabaseError as fault:
+            raise InputError(
+                f"The cache {self.path} is damaged ({fault}); delete it: descriptors are computed "
+                "again, nothing else is lost."
+            ) from fault
+
+
+class StoredVectors:
+    """(N, D) descriptors in a store, read from the file as they are sliced: `vectors[10:20]`.
+
+    Attributes:
+        shape: (N, D).
+    """
+
+    def __init__(self, store: Store, model: str, names: tuple[str, ...]) -> None:
+        self._store, self._model, self._names = store, model, names
+        dim = store.read_vectors(model, names[:1]).shape[1] if names else 0
+        self.shape = (len(names), dim)
+
+    def __getitem__(self, rows: slice) -> NDArray[np.float16]:
+        return self._store.read_vectors(self._model, self._names[rows])
+
+
+def remembered_images(cache: Path) -> Path | None:
+    """Return the photo folder that a cache remembers, or None; makes no file."""
+    if not cache.is_file():
+        return None
+    with Store(cache) as store:
+        folder = store.setting(IMAGES_SETTING)
+    return None if folder is None else cache.parent / folder
+
+
+def _sentence(path: Path, fault: str) -> str:
+    if "locked" in fault:
+        return (
+            f"The cache {path} has been locked by another process for {BUSY_SECONDS:.0f} s; "
+            "wait for it to finish."
+        )
+    if "full" in fault:
+        return f"Cannot write the cache {path}: the disk is full. What was computed so far is kept."
+    if "malformed" in fault or "not a database" in fault:
+        return f"The cache {path} is damaged ({fault}); delete it: nothing else is lost."
+    folder = "" if os.access(path.parent, os.W_OK) else " (the folder cannot be written)"
+    return (
+        f"Cannot use the cache {path}: {fault}{folder}; name a file in a folder that can be "
+        "written with --cache."
+    )

@@ -1,0 +1,287 @@
+"""What is read from a COLMAP database, without changing it.
+
+Opening a database with pycolmap 4 migrates it in place, even for a read. This module therefore
+reads with plain sqlite in read-only mode, and is the only one that knows schema versions:
+COLMAP 3.8 to 4.2 differ in `images.prior_*`, `pose_priors`, `frames` and
+`two_view_geometries`; tables and columns are tested for, since `PRAGMA user_version` cannot
+tell 3.10 from 3.13.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_netvlad.photos.positions import CoordinateSystem, PosePrior
+from colmap_netvlad.runtime.errors import InputError
+from colmap_netvlad.runtime.files import atomic_path
+
+MAX_NUM_IMAGES = 2147483647
+"""COLMAP's factor in `pair_id = MAX_NUM_IMAGES * min(id1, id2) + max(id1, id2)`."""
+
+BUSY_SECONDS = 5.0
+"""How long a read waits for another process's write, s; COLMAP itself waits not at all."""
+
+SIFT_BYTES = 128
+"""Bytes of one SIFT descriptor; `descriptors.cols` counts bytes."""
+
+
+@dataclass(frozen=True)
+class ImageRow:
+    """One image of the database. `name` is relative to the photo folder; sizes in pixels."""
+
+    image_id: int
+    name: str
+    camera_id: int
+    width: int
+    height: int
+
+
+def pair_id(image_id1: int, image_id2: int) -> int:
+    """Return COLMAP's id of an image pair, whatever the order of its images."""
+    low, high = sorted((image_id1, image_id2))
+    return MAX_NUM_IMAGES * low + high
+
+
+def images_of_pair(pair: int) -> tuple[int, int]:
+    """Return the image ids (lower first) of COLMAP's pair id."""
+    return pair // MAX_NUM_IMAGES, pair % MAX_NUM_IMAGES
+
+
+class Database:
+    """A COLMAP database, read only. Made by `open_database`."""
+
+    def __init__(self, connection: sqlite3.Connection, path: Path) -> None:
+        self._connection = connection
+        self.path = path
+
+    def images(self) -> list[ImageRow]:
+        """Return all images in the order of their ids."""
+        rows = self._connection.execute(
+            "SELECT i.image_id, i.name, i.camera_id, COALESCE(c.width, 0), COALESCE(c.height, 0)"
+            " FROM images i LEFT JOIN cameras c USING (camera_id) ORDER BY i.image_id"
+        )
+        return [ImageRow(*row) for row in rows]
+
+    def keypoint_counts(self) -> dict[int, int]:
+        """Return the number of keypoints by image id; images without features are absent."""
+        return dict(self._connection.execute("SELECT image_id, rows FROM keypoints WHERE rows > 0"))
+
+    def descriptor_counts(self) -> dict[int, int]:
+        """Return the number of local descriptors by image id; images without are absent."""
+        return dict(
+            self._connection.execute("SELECT image_id, rows FROM descriptors WHERE rows > 0")
+        )
+
+    def images_with_features(self) -> set[int]:
+        """Return the ids of images whose features COLMAP would not extract again (even if 0)."""
+        rows = self._connection.execute(
+            "SELECT image_id FROM keypoints INTERSECT SELECT image_id FROM descriptors"
+        )
+        return {image_id for (image_id,) in rows}
+
+    def keypoints(self, image_id: int) -> NDArray[np.float32]:
+        """Return (N, 2) keypoint positions x, y in pixels (COLMAP's: centre of pixel 0 is 0.5)."""
+        row = self._connection.execute(
+            "SELECT rows, cols, data FROM keypoints WHERE image_id = ?", (image_id,)
+        ).fetchone()
+        if row is None or not row[0]:
+            return np.zeros((0, 2), np.float32)
+        return np.frombuffer(row[2], np.float32).reshape(row[0], row[1])[:, :2]
+
+    def sift_descriptors(self, image_id: int) -> NDArray[np.uint8]:
+        """Return (N, 128) SIFT descriptors as COLMAP keeps them, 0..255.
+
+        Raises:
+            InputError: the local features are of another kind (ALIKED, say).
+        """
+        row = self._connection.execute(
+            "SELECT rows, cols, data FROM descriptors WHERE image_id = ?", (image_id,)
+        ).fetchone()
+        if row is None or not row[0]:
+            return np.zeros((0, SIFT_BYTES), np.uint8)
+        if row[1] != SIFT_BYTES:
+            raise InputError(
+                f"{self.path} has local features of {row[1]} bytes, not SIFT's {SIFT_BYTES}; "
+                "use a method that reads the photos, or extract SIFT."
+            )
+        return np.frombuffer(row[2], np.uint8).reshape(row[0], SIFT_BYTES)
+
+    def matched_pairs(self) -> set[tuple[int, int]]:
+        """Return the pairs COLMAP's matchers would skip: those with matches and a geometry."""
+        rows = self._connection.execute(
+            "SELECT pair_id FROM matches INTERSECT SELECT pair_id FROM two_view_geometries"
+        )
+        return {images_of_pair(pair) for (pair,) in rows}
+
+    def verified_matches(self) -> dict[tuple[int, int], int]:
+        """Return the number of verified (inlier) matches by pair of image ids, lower first.
+
+        Pairs that were tried and failed have 0.
+        """
+        rows = self._connection.execute("SELECT pair_id, rows FROM two_view_geometries")
+        return {images_of_pair(pair): count for pair, count in rows}
+
+    def inlier_matches(self, image_id1: int, image_id2: int) -> NDArray[np.uint32]:
+        """Return (M, 2) keypoint indices of the verified matches, columns as the ids are given."""
+        row = self._connection.execute(
+            "SELECT rows, data FROM two_view_geometries WHERE pair_id = ?",
+            (pair_id(image_id1, image_id2),),
+        ).fetchone()
+        if row is None or not row[0]:
+            return np.zeros((0, 2), np.uint32)
+        matches = np.frombuffer(row[1], np.uint32).reshape(row[0], 2)
+        return matches if image_id1 <= image_id2 else matches[:, ::-1]
+
+    def pose_priors(self) -> dict[int, PosePrior]:
+        """Return the position priors by image id, from any COLMAP version.
+
+        COLMAP 3.8 and 3.9 kept cartesian `images.prior_t*`; 3.10 on keeps `pose_priors`, keyed by
+        image until 3.13, by sensor data since 4.0. Priors that are not finite are left out.
+        """
+        columns = self._columns("pose_priors")
+        if "corr_data_id" in columns:
+            query = (
+                "SELECT corr_data_id, position, coordinate_system FROM pose_priors"
+                " WHERE corr_sensor_type = 0"
+            )
+        elif "image_id" in columns:
+            query = "SELECT image_id, position, coordinate_system FROM pose_priors"
+        elif "prior_tx" in self._columns("images"):
+            return self._legacy_priors()
+        else:
+            return {}
+        priors = {}
+        for image_id, blob, system in self._connection.execute(query):
+            position = np.frombuffer(blob or b"", np.float64)
+            if position.size == 3 and np.isfinite(position).all():
+                x, y, z = position.tolist()
+                priors[image_id] = PosePrior((x, y, z), CoordinateSystem(system))
+        return priors
+
+    def frames(self) -> dict[int, int]:
+        """Return the rig frame by image id (COLMAP 3.12 on); empty where there are no frames."""
+        if not self._columns("frame_data"):
+            return {}
+        return dict(
+            self._connection.execute(
+                "SELECT data_id, frame_id FROM frame_data WHERE sensor_type = 0"
+            )
+        )
+
+    def _legacy_priors(self) -> dict[int, PosePrior]:
+        rows = self._connection.execute(
+            "SELECT image_id, prior_tx, prior_ty, prior_tz FROM images"
+            " WHERE prior_tx IS NOT NULL AND prior_ty IS NOT NULL AND prior_tz IS NOT NULL"
+        )
+        return {
+            image_id: PosePrior((x, y, z), CoordinateSystem.CARTESIAN)
+            for image_id, x, y, z in rows
+            if np.isfinite([x, y, z]).all()
+        }
+
+    def _columns(self, table: str) -> set[str]:
+        return {row[1] for row in self._connection.execute(f"PRAGMA table_info({table})")}
+
+
+@contextmanager
+def open_database(path: Path) -> Iterator[Database]:
+    """Open a COLMAP database of version 3.8 to 4.2 for reading; the file stays byte-identical.
+
+    Raises:
+        InputError: it is not there, not sqlite, not COLMAP's, or locked by another process.
+    """
+    try:
+        with closing(_connect(path)) as connection:
+            yield Database(connection, path)
+    except sqlite3.OperationalError as fault:
+        if "locked" in str(fault) or "busy" in str(fault):
+            raise InputError(
+                f"{path} is locked by another process; wait for it to finish, or close COLMAP."
+            ) from fault
+        raise InputError(f"{path} cannot be read: {fault}.") from fault
+    except sqlite3.DatabaseError as fault:
+        raise InputError(
+            f"{path} is not a COLMAP database (not a readable sqlite file: {fault})."
+        ) from fault
+
+
+def _connect(path: Path) -> sqlite3.Connection:
+    if not path.is_file():
+        raise InputError(f"The database {path} does not exist; mend --db.")
+    uri = path.resolve().as_uri()
+    wal = path.with_name(path.name + "-wal")
+    # A WAL database at rest is opened for writing and then only queried: a read-only connection
+    # could not take away the -wal and -shm files it makes beside the user's database.
+    mode = "rw" if _is_wal(path) and not wal.exists() else "ro"
+    connection = sqlite3.connect(
+        f"{uri}?mode={mode}", uri=True, timeout=BUSY_SECONDS, check_same_thread=False
+    )
+    try:
+        connection.execute("PRAGMA query_only = ON")
+        tables = _tables(connection)
+    except sqlite3.OperationalError as fault:
+        connection.close()
+        if "locked" in str(fault):
+            raise
+        # A WAL database in a read-only folder cannot make its shared-memory file; where no log
+        # waits beside it nothing can be missed by reading it as immutable.
+        if wal.exists() and wal.stat().st_size > 0:
+            raise
+        connection = sqlite3.connect(
+            f"{uri}?mode=ro&immutable=1", uri=True, check_same_thread=False
+        )
+        tables = _tables(connection)
+    missing = {"cameras", "images", "keypoints", "descriptors", "matches"} - tables
+    if missing:
+        connection.close()
+        raise InputError(
+            f"{path} is not a COLMAP database: it has no table {', '.join(sorted(missing))}."
+        )
+    return connection
+
+
+def _is_wal(path: Path) -> bool:
+    """Whether sqlite's header says write-ahead logging (bytes 18 and 19 are 2)."""
+    with path.open("rb") as file:
+        return file.read(20)[18:] == b"\x02\x02"
+
+
+def _tables(connection: sqlite3.Connection) -> set[str]:
+    return {row[0] for row in connection.execute("SELECT name FROM sqlite_master")}
+
+
+def image_names(path: Path) -> tuple[str, ...]:
+    """Return the image names of a database, in the order of the image ids."""
+    with open_database(path) as database:
+        return tuple(row.name for row in database.images())
+
+
+def copy_database(source: Path, target: Path, *, matches: bool) -> None:
+    """Copy a database consistently (sqlite's backup, so a waiting log is included).
+
+    Args:
+        matches: False leaves matches and two-view geometries out, so that nothing one method
+            matched leaks into another's result.
+
+    Raises:
+        InputError: the source cannot be read, or the target not be written.
+    """
+    with (
+        open_database(source) as database,
+        atomic_path(target) as temporary,
+        closing(sqlite3.connect(temporary)) as copy,
+    ):
+        database._connection.backup(copy)
+        if not matches:
+            copy.execute("DELETE FROM matches")
+            copy.execute("DELETE FROM two_view_geometries")
+            copy.commit()
+            copy.execute("VACUUM")
+        copy.execute("PRAGMA journal_mode = DELETE")

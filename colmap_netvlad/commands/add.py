@@ -1,0 +1,208 @@
+"""New photos into an existing project: only what is new costs anything."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from colmap_netvlad.cache.ranking import NO_PARTNER, Ranking
+from colmap_netvlad.colmap.database import image_names
+from colmap_netvlad.colmap.features import FeatureOptions, FeatureReport, extract_features
+from colmap_netvlad.mapping.extend import extend_model, read_model
+from colmap_netvlad.mapping.options import MappingOptions
+from colmap_netvlad.mapping.output import free_output
+from colmap_netvlad.mapping.summary import ModelSummary, registered_names, summarize
+from colmap_netvlad.matching.run import MatchOptions, MatchReport, match_pairs
+from colmap_netvlad.photos.files import find_photos
+from colmap_netvlad.project import Project
+from colmap_netvlad.retrieval.options import RetrievalOptions
+from colmap_netvlad.retrieval.rank import rank
+from colmap_netvlad.runtime.errors import InputError
+
+
+@dataclass(frozen=True)
+class AddOptions:
+    """Options of `add_photos`.
+
+    Attributes:
+        method: retrieval method.
+        retrieval: k and what else the method takes.
+        among_new: pair the new photos with each other too, not only with the old ones.
+        features: how the new photos are imported.
+        seed: of matching and mapping.
+    """
+
+    method: str
+    retrieval: RetrievalOptions = field(default_factory=RetrievalOptions)
+    among_new: bool = False
+    features: FeatureOptions = field(default_factory=FeatureOptions)
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class AddReport:
+    """What `add_photos` did.
+
+    Attributes:
+        new: names of the photos added.
+        features: report of the import.
+        matches: report of the matching.
+        before, after: the model without and with the new photos.
+        output: folder of the extended model.
+        unregistered: new photos without a pose in the model.
+        seconds: duration by stage, s.
+    """
+
+    new: list[str]
+    features: FeatureReport
+    matches: MatchReport
+    before: ModelSummary
+    after: ModelSummary
+    output: Path
+    unregistered: list[str]
+    seconds: dict[str, float]
+
+
+def add_photos(
+    project: Project, model: Path, options: AddOptions, output: Path | None = None
+) -> AddReport:
+    """Import the photos the database does not have, and register them into a model.
+
+    Features, descriptors, pairs, matches and poses are computed for the new photos alone; pairs
+    are between a new photo and an old one. The model given is left as it is.
+
+    Args:
+        project: its photo folder holds the new photos beside the old ones; its database gets
+            their features and matches.
+        model: folder of the existing sparse model.
+        output: folder of models for the extended one; default `sparse`, `sparse-2`, ...
+
+    Raises:
+        InputError: no new photos, a folder that lacks the old photos, or no such model.
+    """
+    folder = project.need_images()
+    old = image_names(project.database)
+    new = _new_photos(folder, old)
+    before = read_model(model)
+    seconds: dict[str, float] = {}
+
+    start = time.monotonic()
+    features = extract_features(folder, project.database, options.features)
+    usable = sorted(set(image_names(project.database)) - set(old))
+    if not usable:
+        raise InputError(
+            f"None of the {len(new)} new photos in {folder} can be used "
+            f"(first: {features.bad[0][0]} {features.bad[0][1]})."
+        )
+    seconds["features"] = time.monotonic() - start
+
+    start = time.monotonic()
+    pairs = _pairs_of_new(project, set(usable), options)
+    seconds["retrieval"] = time.monotonic() - start
+
+    matches = match_pairs(project.database, pairs, MatchOptions(seed=options.seed))
+    seconds["matching"] = matches.seconds
+
+    start = time.monotonic()
+    target = free_output(output or project.sparse)
+    after = extend_model(
+        project.database,
+        folder,
+        model,
+        target,
+        len(usable),
+        MappingOptions(seed=options.seed),
+    )
+    seconds["mapping"] = time.monotonic() - start
+    registered = registered_names([after])
+    return AddReport(
+        new=usable,
+        features=features,
+        matches=matches,
+        before=summarize(before),
+        after=summarize(after),
+        output=target,
+        unregistered=[name for name in usable if name not in registered],
+        seconds=seconds,
+    )
+
+
+def add_lines(report: AddReport) -> list[str]:
+    """Return what `colmap-netvlad add` prints."""
+    registered = len(report.new) - len(report.unregistered)
+    lines = [
+        f"New photos: {len(report.new):,}, {registered:,} registered "
+        f"({report.before.registered:,} -> {report.after.registered:,} images, "
+        f"{report.before.points:,} -> {report.after.points:,} points, reprojection error "
+        f"{report.before.mean_reprojection_error:.3f} -> "
+        f"{report.after.mean_reprojection_error:.3f} px).",
+        f"Pairs: {report.matches.matched:,} matched, {report.matches.verified:,} verified.",
+        "Minutes: "
+        + ", ".join(f"{stage} {time / 60:.1f}" for stage, time in report.seconds.items())
+        + ".",
+    ]
+    if report.unregistered:
+        lines.append(
+            f"Not registered: {', '.join(report.unregistered[:10])}"
+            f"{', ...' if len(report.unregistered) > 10 else ''}; photos that overlap only other "
+            "new ones need --among-new, or `pairs` and `reconstruct` anew."
+        )
+    return [*lines, f"The extended model is in {report.output}."]
+
+
+def newest_model(project: Project) -> Path:
+    """Return `0` of the highest-numbered `sparse`, `sparse-2`, ... folder of a workspace.
+
+    Raises:
+        InputError: there is none.
+    """
+    folders = [project.sparse, *project.folder.glob(f"{project.sparse.name}-*")]
+    models = [folder / "0" for folder in folders if (folder / "0").is_dir()]
+    if not models:
+        raise InputError(
+            f"There is no model in {project.sparse}; run `colmap-netvlad reconstruct`, or name "
+            "one with --sparse."
+        )
+    return max(models, key=lambda model: _number(model.parent.name))
+
+
+def _number(name: str) -> int:
+    suffix = name.rpartition("-")[2]
+    return int(suffix) if suffix.isdigit() else 1
+
+
+def _new_photos(folder: Path, old: tuple[str, ...]) -> list[str]:
+    there = find_photos(folder)
+    if old and not set(there) & set(old):
+        raise InputError(
+            f"{folder} holds none of the database's photos (first: {old[0]}), and image names are "
+            "relative to one folder: copy the new photos beside the old ones and name that folder."
+        )
+    new = [name for name in there if name not in set(old)]
+    if not new:
+        raise InputError(
+            f"There are no new photos in {folder}: the database has all {len(there)} of them."
+        )
+    return new
+
+
+def _pairs_of_new(project: Project, new: set[str], options: AddOptions) -> list[tuple[str, str]]:
+    """Return each new photo with its k best partners among the old ones (or among all)."""
+    count = len(image_names(project.database))
+    deeper = min(options.retrieval.k + (0 if options.among_new else len(new)), count - 1)
+    ranking = rank(project, options.method, replace(options.retrieval, k=max(deeper, 1)))
+    pairs: list[tuple[str, str]] = []
+    for i, name in enumerate(ranking.names):
+        if name in new:
+            partners = _partners(ranking, i, new, options.among_new)[: options.retrieval.k]
+            pairs.extend((name, partner) for partner in partners)
+    return pairs
+
+
+def _partners(ranking: Ranking, image: int, new: set[str], among_new: bool) -> list[str]:
+    row = ranking.partners[image]
+    names = [ranking.names[j] for j in row[row != NO_PARTNER].astype(np.int64)]
+    return names if among_new else [name for name in names if name not in new]

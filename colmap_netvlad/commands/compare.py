@@ -1,0 +1,275 @@
+"""The same project under several methods: rankings -> pairs -> matches -> models -> report."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from colmap_netvlad import metrics
+from colmap_netvlad.compare import pool
+from colmap_netvlad.compare.evidence import Evidence
+from colmap_netvlad.compare.figures import FULL_RANKING, Candidate, compute_figures, gather_evidence
+from colmap_netvlad.compare.models import kept_figures, reconstruct_once
+from colmap_netvlad.compare.result import Comparison, ModelFigures, write_json
+from colmap_netvlad.compare.workspace import ProjectFacts, Workspace, open_workspace, read_facts
+from colmap_netvlad.graph.pair import Pair, as_pair
+from colmap_netvlad.mapping.options import MappingOptions
+from colmap_netvlad.matching.run import MatchOptions
+from colmap_netvlad.pairs.union import union_of_top
+from colmap_netvlad.project import Project
+from colmap_netvlad.retrieval.methods import deep, find_method
+from colmap_netvlad.retrieval.options import RetrievalOptions, check_k
+from colmap_netvlad.retrieval.rank import rank
+from colmap_netvlad.runtime import progress
+from colmap_netvlad.runtime.errors import InputError
+from colmap_netvlad.runtime.files import write_atomically
+
+ASK_ABOVE = 600.0
+"""Exhaustive matching that is estimated to take longer than this, s, is asked about first."""
+
+STOLEN_TIME = 1.2
+"""A method that reports more than this share of the time it was seen to take reused results."""
+
+Confirm = Callable[[str], bool]
+
+
+@dataclass(frozen=True)
+class CompareOptions:
+    """What a user chooses about a comparison.
+
+    Attributes:
+        ks: numbers of partners to compare; clamped to the number of other images.
+        output: the comparison's folder; None: `<database>-compare` beside the database.
+        reconstruct: whether each method's model is made; one made earlier is shown in any case.
+        reconstruct_k: the number of partners the models are made from, one of `ks`; None: the
+            largest.
+        retrieval: device, vocabulary tree; its k and seed are set from here.
+        seed: of every method, of verification and of mapping.
+        matching, mapping: their other options.
+    """
+
+    ks: tuple[int, ...] = (30,)
+    output: Path | None = None
+    reconstruct: bool = True
+    reconstruct_k: int | None = None
+    retrieval: RetrievalOptions = field(default_factory=RetrievalOptions)
+    seed: int = 0
+    matching: MatchOptions = field(default_factory=MatchOptions)
+    mapping: MappingOptions = field(default_factory=MappingOptions)
+
+
+def compare(
+    project: Project,
+    methods: Sequence[str],
+    options: CompareOptions = CompareOptions(),
+    confirm: Confirm = lambda question: False,
+) -> tuple[Comparison, Workspace]:
+    """Compare retrieval methods on one project, and write the report.
+
+    The user's database is read only. Everything is kept in the comparison's folder: a killed run
+    goes on where it stopped, and methods asked for in a later run are added to the earlier ones.
+
+    Args:
+        methods: names of the table of methods, or checkpoints by path.
+        confirm: asked with one question before an exhaustive matching that takes long.
+
+    Returns:
+        The figures, and the folder with the page and tables. A method that fails is in
+        `Comparison.incomplete`; the others are complete.
+
+    Raises:
+        InputError: no method, an unknown one, no features, k out of range, a folder that is not
+            this project's comparison, or exhaustive matching that was not confirmed.
+    """
+    if not methods:
+        raise InputError("No method to compare; name some with --methods bow,vlad,...")
+    texts = [_stable_text(text) for text in methods]
+    facts = read_facts(project.database)
+    ks = _checked_ks(options, len(facts.names))
+    folder = options.output or project.folder / f"{project.database.stem}-compare"
+    workspace = open_workspace(folder, project.database, facts)
+    candidates = _candidates(workspace.add_methods(texts))
+    matching = replace(options.matching, seed=options.seed)
+    if any(not candidate.ranks for candidate in candidates):
+        _check_cost(workspace, facts, matching, confirm)
+    for candidate in candidates:
+        _rank(candidate, project, workspace, facts, ks, options)
+    pairs = {k: {c.name: _pairs(c, k) for c in candidates if c.ranking} for k in ks}
+    matched_now = pool.match_once(workspace, pairs[ks[-1]], matching)
+    _say_matched(pairs[ks[-1]], matched_now)
+    k = ks[-1] if options.reconstruct_k is None else _clamped(options.reconstruct_k, facts)
+    for candidate in candidates:
+        if candidate.ranking:
+            _map(candidate, workspace, project.images, pairs[k][candidate.name], k, options)
+    evidence = gather_evidence(project, workspace, facts, candidates, pairs[ks[-1]])
+    comparison = compute_figures(
+        project, workspace, facts, candidates, pairs, evidence, options.seed
+    )
+    write_report(workspace, comparison, evidence)
+    return comparison, workspace
+
+
+def parse_ks(text: str) -> tuple[int, ...]:
+    """Read `10,20,30`.
+
+    Raises:
+        InputError: it is not a list of whole numbers.
+    """
+    try:
+        return tuple(int(part) for part in text.split(",") if part.strip())
+    except ValueError:
+        raise InputError(
+            f"--k is {text!r}; it is a whole number or several with commas, as in --k 10,20,30."
+        ) from None
+
+
+def write_report(workspace: Workspace, comparison: Comparison, evidence: Evidence) -> None:
+    """Write `compare.json`, `compare.csv` and `compare.html`."""
+    from colmap_netvlad.report.comparison import write_csv
+    from colmap_netvlad.report.page import render_page
+
+    write_json(workspace.json, comparison)
+    write_csv(workspace.csv, comparison)
+    write_atomically(workspace.html, render_page(comparison, evidence))
+
+
+def _checked_ks(options: CompareOptions, images: int) -> tuple[int, ...]:
+    if not options.ks:
+        raise InputError("--k names no number of partners; give one or several: --k 10,20,30.")
+    ks = tuple(sorted({check_k(k, images) for k in options.ks}))
+    wanted = options.reconstruct_k
+    if wanted is not None and check_k(wanted, images) not in ks:
+        raise InputError(
+            f"--reconstruct-k is {wanted}, which is not one of --k {', '.join(map(str, ks))}."
+        )
+    return ks
+
+
+def _clamped(k: int, facts: ProjectFacts) -> int:
+    return check_k(k, len(facts.names))
+
+
+def _stable_text(text: str) -> str:
+    """Check a method's name, and make the path of a checkpoint absolute, so that it is found
+    again from another folder."""
+    find_method(text)
+    return str(Path(text).resolve()) if Path(text).is_file() else text
+
+
+def _candidates(texts: Sequence[str]) -> list[Candidate]:
+    """Find all methods, also of earlier runs: one that has gone since is a failed one."""
+    candidates: list[Candidate] = []
+    for text in texts:
+        try:
+            method = find_method(text)
+            candidate = Candidate(text, method.name, method.summary)
+        except InputError as fault:
+            candidate = Candidate(text, Path(text).stem, "", failed=fault.message)
+        if candidate.name in {other.name for other in candidates}:
+            candidate.name = text
+        candidates.append(candidate)
+    return candidates
+
+
+def _check_cost(
+    workspace: Workspace, facts: ProjectFacts, options: MatchOptions, confirm: Confirm
+) -> None:
+    """Say what exhaustive matching will cost, and ask where that is long."""
+    possible = len(facts.names) * (len(facts.names) - 1) // 2
+    left = possible - len(pool.matched(workspace))
+    if not left:
+        return
+    each = pool.measure_cost(workspace, facts.names, options)
+    minutes = each * left / 60
+    cost = (
+        f"Exhaustive matching: {left:,} pairs, about {minutes:.1f} min "
+        f"({each:.3f} s a pair, measured on {min(pool.SAMPLE, possible)})."
+    )
+    progress.console.print(cost, highlight=False)
+    if minutes * 60 > ASK_ABOVE and not confirm(f"{cost} Go on?"):
+        raise InputError(f"{cost} Say --yes, or leave the method exhaustive out.")
+
+
+def _rank(
+    candidate: Candidate,
+    project: Project,
+    workspace: Workspace,
+    facts: ProjectFacts,
+    ks: tuple[int, ...],
+    options: CompareOptions,
+) -> None:
+    if candidate.failed:
+        return
+    count = len(facts.names)
+    depth = count - 1 if count <= FULL_RANKING else ks[-1]
+    retrieval = replace(options.retrieval, k=depth, seed=options.seed)
+    try:
+        key = _ranking_key(candidate.text, retrieval)
+        kept = workspace.load_ranking(key)
+        if kept is None:
+            progress.console.print(f"Ranking by {candidate.name}", highlight=False)
+            start = time.perf_counter()
+            ranking = rank(project, candidate.text, retrieval).top(depth)
+            seen = time.perf_counter() - start
+            kept = ranking, metrics.efficiency(ranking) > STOLEN_TIME * seen
+            workspace.save_ranking(key, *kept)
+        candidate.ranking, candidate.timed_earlier = kept
+    except Exception as fault:  # whatever stops one method leaves the others
+        candidate.failed = _reason(fault)
+
+
+def _ranking_key(text: str, options: RetrievalOptions) -> str:
+    """Everything a ranking of the same features depends on."""
+    method = find_method(text)
+    key = f"{text}-k{options.k}-seed{options.seed}"
+    if options.vocab_tree is not None and method.name == "bow":
+        key += f"-{options.vocab_tree.resolve()}-{options.vocab_tree.stat().st_mtime_ns}"
+    if method.model is not None:
+        key += f"-{deep.model_fingerprint(deep.checkpoint_file(method.model))}"
+        key += f"-rerank{options.rerank}"
+    return key
+
+
+def _pairs(candidate: Candidate, k: int) -> set[Pair]:
+    assert candidate.ranking is not None
+    depth = k if candidate.ranks else candidate.ranking.depth
+    return {as_pair(p.name1, p.name2) for p in union_of_top(candidate.ranking, depth)}
+
+
+def _say_matched(pairs: Mapping[str, set[Pair]], now: int) -> None:
+    distinct = len(set().union(*pairs.values()))
+    asked = sum(map(len, pairs.values()))
+    progress.console.print(
+        f"Matched each distinct pair once: {distinct:,} pairs for {asked:,} asked by "
+        f"{len(pairs)} methods, {now:,} of them now.",
+        highlight=False,
+    )
+
+
+def _map(
+    candidate: Candidate,
+    workspace: Workspace,
+    images: Path | None,
+    pairs: set[Pair],
+    k: int,
+    options: CompareOptions,
+) -> None:
+    mapping = replace(options.mapping, seed=options.seed)
+    folder = workspace.model_folder(candidate.name)
+    candidate.model = kept_figures(folder, pairs, k, mapping)
+    if candidate.model or not options.reconstruct:
+        return
+    progress.console.print(f"Mapping {candidate.name}", highlight=False)
+    try:
+        candidate.model = reconstruct_once(workspace.union, images, folder, pairs, k, mapping)
+    except Exception as fault:  # whatever stops one method leaves the others
+        candidate.model = ModelFigures(k, failed=_reason(fault))
+
+
+def _reason(fault: Exception) -> str:
+    if isinstance(fault, InputError):
+        return fault.message
+    lines = str(fault).strip().splitlines()
+    return f"{type(fault).__name__}: {lines[0] if lines else 'no message'}"

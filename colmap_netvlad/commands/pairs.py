@@ -1,0 +1,247 @@
+"""What `colmap-netvlad pairs` does: rank, take the union of the top k, write the pairs list."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from colmap_netvlad.cache.ranking import Ranking
+from colmap_netvlad.cache.store import Store
+from colmap_netvlad.colmap.database import image_names, open_database
+from colmap_netvlad.graph.components import component_names, components
+from colmap_netvlad.models.catalogue import CATALOGUE, DEFAULT
+from colmap_netvlad.pairs.connect import apart_lines, connecting_budget, connecting_pairs
+from colmap_netvlad.pairs.lists import FORMATS, read_pairs, write_pairs
+from colmap_netvlad.pairs.rules import (
+    PartnerRules,
+    join_pairs,
+    sequential_pairs,
+    with_camera_quota,
+    without_same_frame,
+)
+from colmap_netvlad.pairs.union import ImagePair, union_of_top
+from colmap_netvlad.project import Project
+from colmap_netvlad.retrieval.fusion import similarity_matrix
+from colmap_netvlad.retrieval.methods.hybrid import fusion_depth
+from colmap_netvlad.retrieval.options import COMPARED, RetrievalOptions, check_k
+from colmap_netvlad.retrieval.rank import rank
+from colmap_netvlad.runtime.errors import InputError
+
+NO_RULES = PartnerRules()
+SUFFIXES = {"colmap": ".txt", "csv": ".csv", "json": ".json"}
+
+
+@dataclass(frozen=True)
+class PairsReport:
+    """The result of `make_pairs`.
+
+    Attributes:
+        ranking: what the pairs were taken from, k deep.
+        pairs: the union of every image's own k partners.
+        components: image names of each connected component of the pairs, largest first.
+        connecting: pairs between components that were added because each image's own k partners
+            do not connect all images.
+        output: the pairs list that holds every pair.
+        colmap_list: the list for COLMAP, where it cannot hold all pairs and so differs from
+            `output`; else None.
+        unwritable: image names that COLMAP's list cannot express.
+        has_features: whether the database has local features, which `hybrid` uses as well.
+    """
+
+    ranking: Ranking
+    pairs: list[ImagePair]
+    components: list[list[str]]
+    output: Path
+    colmap_list: Path | None
+    unwritable: list[str]
+    has_features: bool = False
+    connecting: int = 0
+
+
+def make_pairs(
+    project: Project,
+    method: str = DEFAULT,
+    options: RetrievalOptions | None = None,
+    format: str = "colmap",
+    output: Path | None = None,
+    rules: PartnerRules = NO_RULES,
+    connect: bool = True,
+) -> PairsReport:
+    """Retrieve each image's k nearest partners and write the union as a pairs list.
+
+    Never writes to the user's database. Descriptors, ranks and scores are kept in the project's
+    cache, where the photo folder is remembered as well.
+
+    Args:
+        project: database, photos, cache.
+        method: a name in `methods.METHODS`, or a checkpoint file.
+        options: k and what else a method takes.
+        format: "colmap", "csv" or "json".
+        output: the pairs list; default `pairs.txt` (.csv, .json) beside the database. Names that
+            COLMAP's list cannot express (spaces, a leading #) make a second, complete list:
+            the same name ending in .csv.
+        rules: cameras, sequences and pairs the user knows of; photos of one rig frame are never
+            paired.
+        connect: where the k nearest leave the images in several components, add the best pairs
+            between these, at most `connecting_budget` of them.
+
+    Raises:
+        InputError: anything in the input a user can mend.
+    """
+    options = options or RetrievalOptions()
+    if format not in FORMATS:
+        raise InputError(f"There is no format {format!r}; formats are {', '.join(FORMATS)}.")
+    output = output or project.pairs.with_suffix(SUFFIXES[format])
+    _protect(output, project)
+    rules.check()
+    names = image_names(project.database)
+    extra = _extra_pairs(names, rules)
+    ranking = _rank_by_rules(project, method, options, rules)
+    pairs = join_pairs(union_of_top(ranking, ranking.depth), extra, names)
+    _remember(project, ranking)
+    found = len(pairs)
+    if connect:
+        pairs = _connect(project, method, options, ranking, pairs)
+    unwritable = write_pairs(output, pairs, format)
+    colmap_list = None
+    if unwritable:
+        colmap_list, output = output, output.with_suffix(".csv")
+        write_pairs(output, pairs, "csv")
+    with open_database(project.database) as database:
+        has_features = bool(database.descriptor_counts())
+    return PairsReport(
+        ranking,
+        pairs,
+        component_names(names, [(pair.name1, pair.name2) for pair in pairs]),
+        output,
+        colmap_list,
+        unwritable,
+        has_features,
+        len(pairs) - found,
+    )
+
+
+def _rank_by_rules(
+    project: Project, method: str, options: RetrievalOptions, rules: PartnerRules
+) -> Ranking:
+    """Rank, and choose each image's k partners with regard to rig frames and cameras."""
+    with open_database(project.database) as database:
+        images = database.images()
+        frames = database.frames()
+    k = check_k(options.k, len(images))
+    is_rig = len(set(frames.values())) < len(frames)
+    if not is_rig and not rules.other_cameras:
+        ranking = rank(project, method, options)
+        return ranking if ranking.method == "exhaustive" else ranking.top(k)
+    # What the rules take out must be replaced from further down.
+    ranking = _rank_deeply(project, method, options)
+    cameras = [image.camera_id for image in images]
+    return with_camera_quota(ranking, cameras, k, rules.other_cameras)
+
+
+def _rank_deeply(project: Project, method: str, options: RetrievalOptions) -> Ranking:
+    """Rank further down than k, without partners of an image's own rig frame."""
+    with open_database(project.database) as database:
+        images = database.images()
+        frames = database.frames()
+    deeper = replace(options, k=min(fusion_depth(options.k), len(images) - 1))
+    ranking = rank(project, method, deeper)
+    return without_same_frame(ranking, [frames.get(image.image_id) for image in images])
+
+
+def _connect(
+    project: Project,
+    method: str,
+    options: RetrievalOptions,
+    ranking: Ranking,
+    pairs: list[ImagePair],
+) -> list[ImagePair]:
+    """Return the pairs with the best ones between their components added, if there are several."""
+    names = ranking.names
+    index = {name: i for i, name in enumerate(names)}
+    chosen = [(index[pair.name1], index[pair.name2]) for pair in pairs]
+    component = components(len(names), chosen)
+    if ranking.method == "exhaustive" or not component.any():
+        return pairs
+    deep = _rank_deeply(project, method, options)
+    candidates = {(p.name1, p.name2): p for p in union_of_top(deep, deep.depth)}
+    added = connecting_pairs(
+        similarity_matrix(deep), component, chosen, names, connecting_budget(len(pairs))
+    )
+    links = [candidates[names[i], names[j]] for i, j in added]
+    return sorted([*pairs, *links], key=lambda pair: (index[pair.name1], index[pair.name2]))
+
+
+def _extra_pairs(names: Sequence[str], rules: PartnerRules) -> list[tuple[str, str]]:
+    extra = sequential_pairs(names, rules.sequential)
+    if rules.own_pairs is not None:
+        extra += read_pairs(rules.own_pairs, names)
+    return extra
+
+
+def summary(project: Project, report: PairsReport) -> list[str]:
+    """Return the lines that `colmap-netvlad pairs` prints."""
+    ranking = report.ranking
+    lines = [
+        f"Images       {len(ranking.names)}",
+        f"Pairs        {len(report.pairs)}  ({ranking.method}, union of each image's "
+        f"{ranking.depth} nearest)",
+        f"Description  {ranking.seconds_describe:.1f} s",
+        f"Search       {ranking.seconds_search:.1f} s",
+        *(f"Note         {note}" for note in ranking.notes),
+        *_component_lines(report),
+        f"Written      {report.output}",
+    ]
+    if report.colmap_list is not None:
+        lines.append(
+            f"Warning      {report.colmap_list} lacks the pairs of {len(report.unwritable)} "
+            f"images: COLMAP's list cannot hold names such as {report.unwritable[0]!r}; "
+            f"{report.output.name} has all pairs, and the next command reads it."
+        )
+    if report.has_features and ranking.method in CATALOGUE and len(ranking.names) > COMPARED + 1:
+        lines.append(
+            "Better       --method hybrid looks for candidates by the database's SIFT features "
+            "too, and by GPS where there is any, for little time"
+        )
+    return [*lines, f"Next         {_next_command(project, report)}"]
+
+
+def _component_lines(report: PairsReport) -> list[str]:
+    groups, lines = report.components, []
+    if report.connecting:
+        lines.append(
+            f"Connecting   {report.connecting} pairs added between components that each image's "
+            f"{report.ranking.depth} nearest leave apart (--no-connect: none)"
+        )
+    if len(groups) == 1:
+        return [*lines, "Components   1: the pairs connect all images"]
+    return [
+        *lines,
+        f"Components   {len(groups)}: the pairs do not connect all images; a larger --k may. "
+        f"The largest has {len(groups[0])} images; apart from it are:",
+        *(f"             {line}" for line in apart_lines(groups)),
+    ]
+
+
+def _next_command(project: Project, report: PairsReport) -> str:
+    words = ["colmap-netvlad", "reconstruct", "--db", str(project.database)]
+    if report.output != project.pairs:
+        words += ["--pairs", str(report.output)]
+    return shlex.join(words)
+
+
+def _protect(output: Path, project: Project) -> None:
+    for precious in (project.database, project.cache):
+        if output.resolve() == precious.resolve():
+            raise InputError(f"--output would overwrite {precious}; name another file.")
+
+
+def _remember(project: Project, ranking: Ranking) -> None:
+    """Keep the ranking and the photo folder, which as part of the workspace moves with it."""
+    with Store(project.cache) as store:
+        if project.images is not None:
+            store.remember_images(project.images)
+        if ranking.method != "exhaustive":  # all pairs in order say nothing worth keeping
+            store.save_ranking(ranking)

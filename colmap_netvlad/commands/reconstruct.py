@@ -1,0 +1,237 @@
+"""Pairs list -> matches -> sparse models -> report: what the command `reconstruct` does."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from rich.table import Table
+
+from colmap_netvlad.colmap.database import copy_database, open_database
+from colmap_netvlad.graph.verified import verified_components
+from colmap_netvlad.mapping import MAPPERS
+from colmap_netvlad.mapping.options import MappingOptions
+from colmap_netvlad.mapping.output import free_output
+from colmap_netvlad.mapping.summary import ModelSummary, combine, registered_names, summarize
+from colmap_netvlad.matching.run import MatchOptions, MatchReport, match_pairs
+from colmap_netvlad.pairs.connect import apart_lines
+from colmap_netvlad.pairs.lists import read_pairs
+from colmap_netvlad.project import Project
+from colmap_netvlad.runtime.errors import InputError
+
+MISSING_SHOWN = 10
+"""Names of unregistered images that are printed."""
+
+
+@dataclass(frozen=True)
+class ReconstructOptions:
+    """Options of `reconstruct`.
+
+    Attributes:
+        mapper: name in `mapping.MAPPERS`.
+        mapping: what the mapper is told.
+        matching: how pairs are matched.
+    """
+
+    mapper: str = "incremental"
+    mapping: MappingOptions = MappingOptions()
+    matching: MatchOptions = MatchOptions()
+
+
+@dataclass(frozen=True)
+class ReconstructReport:
+    """What `reconstruct` did.
+
+    Attributes:
+        output: folder of the models.
+        images: images in the database.
+        matches: report of the matching.
+        models: figures of each model, in the order of their folders.
+        total: figures of all models together.
+        missing: names of the images without a pose in any model.
+        seconds: duration by stage, s.
+        components: image names of each component of the verified view graph, largest first.
+    """
+
+    output: Path
+    images: int
+    matches: MatchReport
+    models: list[ModelSummary]
+    total: ModelSummary
+    missing: list[str] = field(default_factory=list)
+    seconds: dict[str, float] = field(default_factory=dict)
+    components: list[list[str]] = field(default_factory=list)
+
+
+def reconstruct(
+    project: Project,
+    pairs: Path | None = None,
+    output: Path | None = None,
+    options: ReconstructOptions = ReconstructOptions(),
+) -> ReconstructReport:
+    """Match the pairs of a list, map, and write the sparse models.
+
+    It writes matches into the project's database, where COLMAP keeps them. Pairs matched before
+    are not matched again.
+
+    Args:
+        project: database and photos.
+        pairs: the pairs list; default: `pairs.txt` beside the database.
+        output: folder of the models; default: `sparse` beside the database, or `sparse-2`,
+            `sparse-3`, ... where there are models already.
+        options: mapper, seeds, limits.
+
+    Raises:
+        InputError: no pairs list, no features, an unknown mapper, or no model at all.
+    """
+    check_mapper(options.mapper)
+    with open_database(project.database) as colmap:
+        names = [row.name for row in colmap.images()]
+    chosen = read_pairs(_existing(pairs or project.pairs), names)
+    if not chosen:
+        raise InputError(f"{pairs or project.pairs} lists no pairs; run `colmap-netvlad pairs`.")
+    matches = match_pairs(project.database, chosen, options.matching)
+    return map_and_report(project, matches, output, options)
+
+
+def map_and_report(
+    project: Project,
+    matches: MatchReport,
+    output: Path | None = None,
+    options: ReconstructOptions = ReconstructOptions(),
+) -> ReconstructReport:
+    """Map a database whose pairs are matched, and sum up.
+
+    Raises:
+        InputError: no pair was verified, or no model came out of it.
+    """
+    check_mapper(options.mapper)
+    if not matches.verified:
+        raise InputError(
+            f"None of the {matches.requested} pairs could be verified, so there is nothing to "
+            "reconstruct; the photos may not overlap, or the pairs list be of other photos."
+        )
+    target = free_output(output or project.sparse)
+    start = time.monotonic()
+    models = MAPPERS[options.mapper](project.database, project.images, target, options.mapping)
+    seconds = {"matching": matches.seconds, "mapping": time.monotonic() - start}
+    if not models:
+        raise InputError(
+            f"No model came out of {matches.verified} verified pairs: none has enough inliers and "
+            "baseline to start from. More pairs (--k) or more overlap may help."
+        )
+    registered = registered_names(models)
+    with open_database(project.database) as colmap:
+        names = [row.name for row in colmap.images()]
+    return ReconstructReport(
+        output=target,
+        images=len(names),
+        matches=matches,
+        models=[summarize(model) for model in models],
+        total=combine(models),
+        missing=[name for name in names if name not in registered],
+        seconds=seconds,
+        components=verified_components(project.database),
+    )
+
+
+def working_copy(project: Project) -> Project:
+    """Return the project on a copy of its database, `<name>.copy.db` beside it.
+
+    A copy of the same images and features is taken up again, with the matches in it; any other
+    is replaced.
+
+    Raises:
+        InputError: the copy cannot be written.
+    """
+    copy = project.database.with_suffix(".copy.db")
+    if not (copy.exists() and _features(copy) == _features(project.database)):
+        copy_database(project.database, copy, matches=True)
+    return Project(copy, project.images)
+
+
+def check_mapper(name: str) -> None:
+    """Raise InputError unless `name` is a mapper."""
+    if name not in MAPPERS:
+        raise InputError(f"There is no mapper {name}; choose {', '.join(MAPPERS)}.")
+
+
+def report_table(report: ReconstructReport) -> Table:
+    """Return the figures of every component, and in total where there are several."""
+    table = Table(title=f"Sparse model in {report.output}", title_justify="left")
+    table.add_column("Component")
+    for column in (
+        "Registered\nimages",
+        "3D points",
+        "Mean reprojection\nerror (px)",
+        "Mean track\nlength",
+        "Observations",
+    ):
+        table.add_column(column, justify="right", no_wrap=True)
+    for index, model in enumerate(report.models):
+        table.add_row(str(index), *_cells(model, report.images))
+    if len(report.models) > 1:
+        table.add_section()
+        table.add_row("total", *_cells(report.total, report.images))
+    return table
+
+
+def report_lines(report: ReconstructReport) -> list[str]:
+    """Return what stands below the table: pairs, minutes of each stage, images left out."""
+    matches = report.matches
+    lines = [
+        f"Pairs: {matches.requested:,} ({matches.already:,} matched before, "
+        f"{matches.matched:,} now), {matches.verified:,} verified.",
+        "Minutes: "
+        + ", ".join(f"{stage} {time / 60:.1f}" for stage, time in report.seconds.items())
+        + f", together {sum(report.seconds.values()) / 60:.1f}.",
+    ]
+    lines += view_graph_lines(report.components)
+    if report.missing:
+        lines.append(
+            f"Not registered: {len(report.missing)} of {report.images} images: "
+            f"{_first(report.missing)}."
+        )
+    return lines
+
+
+def view_graph_lines(groups: Sequence[Sequence[str]]) -> list[str]:
+    """Return which images no verified pair joins to the rest, or nothing."""
+    if len(groups) < 2:
+        return []
+    return [
+        f"View graph: {len(groups)} components; apart from the largest of {len(groups[0]):,} "
+        "images are (a larger --k, or --rounds, may join them):",
+        *(f"  {line}" for line in apart_lines(groups)),
+    ]
+
+
+def _cells(model: ModelSummary, images: int) -> tuple[str, ...]:
+    return (
+        f"{model.registered:,} of {images:,}",
+        f"{model.points:,}",
+        f"{model.mean_reprojection_error:.3f}",
+        f"{model.mean_track_length:.2f}",
+        f"{model.observations:,}",
+    )
+
+
+def _first(names: Sequence[str]) -> str:
+    shown = ", ".join(names[:MISSING_SHOWN])
+    return shown if len(names) <= MISSING_SHOWN else f"{shown}, ..."
+
+
+def _existing(pairs: Path) -> Path:
+    if not pairs.is_file():
+        raise InputError(
+            f"There is no pairs list {pairs}; make it with `colmap-netvlad pairs`, or name one "
+            "with --pairs."
+        )
+    return pairs
+
+
+def _features(database: Path) -> tuple[list[tuple[int, str]], dict[int, int]]:
+    with open_database(database) as colmap:
+        return [(row.image_id, row.name) for row in colmap.images()], colmap.keypoint_counts()

@@ -1,0 +1,1 @@
+"""Verified pairs as a graph of images."""

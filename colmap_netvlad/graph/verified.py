@@ -1,0 +1,42 @@
+"""What a database's verified pairs say."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from colmap_netvlad.colmap.database import image_names, open_database
+from colmap_netvlad.graph.components import component_names
+from colmap_netvlad.graph.pair import Pair, as_pair
+
+
+def verified_components(database: Path) -> list[list[str]]:
+    """Return the components of a database's verified view graph, the largest first.
+
+    Raises:
+        InputError: the database cannot be read.
+    """
+    return component_names(image_names(database), correct_pairs(verified_by_name(database)))
+
+
+def verified_by_name(database: Path) -> dict[Pair, int]:
+    """Return the verified (inlier) matches of every pair tried in a COLMAP database.
+
+    Pairs that were tried and failed have 0.
+
+    Raises:
+        InputError: the database cannot be read.
+    """
+    with open_database(database) as opened:
+        names = {row.image_id: row.name for row in opened.images()}
+        counts = opened.verified_matches()
+    return {as_pair(names[a], names[b]): count for (a, b), count in counts.items()}
+
+
+CORRECT_MATCHES = 15
+"""A pair is correct with MORE verified matches than this (section 4.1.2)."""
+
+
+def correct_pairs(verified: Mapping[Pair, int], more_than: int = CORRECT_MATCHES) -> set[Pair]:
+    """Return the pairs with more than `more_than` verified matches."""
+    return {as_pair(*pair) for pair, count in verified.items() if count > more_than}

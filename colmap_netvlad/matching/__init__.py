@@ -1,0 +1,1 @@
+"""Image pairs -> verified matches in the database."""

@@ -1,0 +1,1 @@
+"""Rankings -> the image pairs to match, and lists of them."""

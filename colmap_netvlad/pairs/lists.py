@@ -1,0 +1,111 @@
+"""Rankings -> a set of image pairs, and pairs lists on disk."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Collection, Iterable, Sequence
+from pathlib import Path
+
+from colmap_netvlad.pairs.union import ImagePair
+from colmap_netvlad.runtime.errors import InputError
+from colmap_netvlad.runtime.files import write_atomically
+
+FORMATS = ("colmap", "csv", "json")
+
+
+def write_pairs(path: Path, pairs: Sequence[ImagePair], format: str = "colmap") -> list[str]:
+    """Write a pairs list whole or not at all, and return the names it could not hold.
+
+    COLMAP's list splits a line on its first space, so a name with a space (or one that starts
+    with `#`) cannot stand in it: such pairs are left out of that format and their names
+    returned. CSV and JSON hold every name and the scores.
+    """
+    text, unwritable = _TEXT[format](pairs)
+    write_atomically(path, text)
+    return unwritable
+
+
+def read_pairs(path: Path, names: Collection[str]) -> list[tuple[str, str]]:
+    """Read a pairs list in any of our formats (known by its suffix, else COLMAP's).
+
+    Pairs twice in either order are taken once; blank lines and lines starting with `#` are
+    skipped as COLMAP does.
+
+    Raises:
+        InputError: the file is missing or malformed, or names an image not in `names`.
+    """
+    if not path.is_file():
+        raise InputError(f"The pairs list {path} does not exist; `colmap-netvlad pairs` makes it.")
+    try:
+        raw = _READERS.get(path.suffix, _read_colmap)(path.read_text(encoding="utf-8"))
+    except (ValueError, KeyError, TypeError) as fault:
+        raise InputError(f"{path} is not a pairs list: {fault}.") from fault
+    known = set(names)
+    unknown = sorted({name for pair in raw for name in pair} - known)
+    if unknown:
+        raise InputError(
+            f"{path} names {len(unknown)} image{'s' if len(unknown) > 1 else ''} that the database "
+            f"does not have (first: {unknown[0]}); make the list from this database."
+        )
+    unique: dict[frozenset[str], tuple[str, str]] = {}
+    for a, b in raw:
+        if a != b:
+            unique.setdefault(frozenset((a, b)), (a, b))
+    return list(unique.values())
+
+
+def _in_colmap_list(name: str) -> bool:
+    """Whether COLMAP's pairs list can express an image name."""
+    return not (name.startswith("#") or any(c.isspace() for c in name))
+
+
+def _colmap_text(pairs: Iterable[ImagePair]) -> tuple[str, list[str]]:
+    lines, unwritable = [], set()
+    for pair in pairs:
+        bad = [name for name in (pair.name1, pair.name2) if not _in_colmap_list(name)]
+        unwritable.update(bad)
+        if not bad:
+            lines.append(f"{pair.name1} {pair.name2}\n")
+    return "".join(lines), sorted(unwritable)
+
+
+def _csv_text(pairs: Iterable[ImagePair]) -> tuple[str, list[str]]:
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(["name1", "name2", "score", "rank"])
+    writer.writerows([p.name1, p.name2, f"{p.score:.6g}", p.rank] for p in pairs)
+    return out.getvalue(), []
+
+
+def _json_text(pairs: Iterable[ImagePair]) -> tuple[str, list[str]]:
+    rows = [
+        {"name1": p.name1, "name2": p.name2, "score": round(p.score, 6), "rank": p.rank}
+        for p in pairs
+    ]
+    return json.dumps(rows, indent=1, ensure_ascii=False) + "\n", []
+
+
+def _read_colmap(text: str) -> list[tuple[str, str]]:
+    pairs = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        words = line.split()
+        if len(words) != 2:
+            raise ValueError(f"line {number} has {len(words)} names, not 2")
+        pairs.append((words[0], words[1]))
+    return pairs
+
+
+def _read_csv(text: str) -> list[tuple[str, str]]:
+    return [(row["name1"], row["name2"]) for row in csv.DictReader(io.StringIO(text))]
+
+
+def _read_json(text: str) -> list[tuple[str, str]]:
+    return [(row["name1"], row["name2"]) for row in json.loads(text)]
+
+
+_TEXT = {"colmap": _colmap_text, "csv": _csv_text, "json": _json_text}
+_READERS = {".csv": _read_csv, ".json": _read_json}

@@ -1,0 +1,1 @@
+"""Files of photos: what is in them before anything is computed."""

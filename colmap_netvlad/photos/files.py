@@ -1,0 +1,167 @@
+"""Photos -> pixels: fast reduced-scale decoding, EXIF orientation, batches of equal size.
+
+Nothing here knows about networks: pixels leave as 8-bit RGB, and a model normalises them itself.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import os
+import struct
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, UnidentifiedImageError
+
+PHOTO_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"})
+"""What counts as a photo in a folder; other files (raw, video, logs) are passed over."""
+
+
+MIN_SIDE = 16
+"""Photos with a shorter side than this hold nothing to describe, px."""
+
+FINGERPRINT_BLOCKS = 8
+FINGERPRINT_BLOCK_BYTES = 16 * 1024
+
+# Aerial mosaics exceed Pillow's guard against decompression bombs. Pillow only reads headers
+# here; OpenCV, which decodes, has its own limit of 2^30 pixels.
+Image.MAX_IMAGE_PIXELS = None
+warnings.filterwarnings("ignore", "Corrupt EXIF data", UserWarning)
+
+
+class BadPhoto(Exception):
+    """A photo that cannot be used. Its text is the reason, fit for a list shown to the user."""
+
+
+@dataclass(frozen=True)
+class PhotoHeader:
+    """What a photo's header says, without decoding its pixels.
+
+    Attributes:
+        width, height: pixels as stored, before any EXIF rotation (COLMAP's camera size).
+        lens: EXIF make, model and focal length, which tell cameras apart; None where EXIF
+            lacks one of them.
+    """
+
+    width: int
+    height: int
+    lens: tuple[str, str, float] | None
+
+
+def find_photos(folder: Path) -> list[str]:
+    """Return the sorted names, relative with '/', of the photos in a folder and its subfolders.
+
+    Hidden files and folders (macOS leaves `._DJI_0001.JPG` on memory cards) are passed over.
+    """
+    names = []
+    for parent, folders, files in os.walk(folder, followlinks=True):
+        folders[:] = [name for name in folders if not name.startswith(".")]
+        for name in files:
+            if not name.startswith(".") and Path(name).suffix.lower() in PHOTO_SUFFIXES:
+                names.append(Path(parent, name).relative_to(folder).as_posix())
+    return sorted(names)
+
+
+def photo_fingerprint(path: Path) -> str:
+    """Return a fingerprint of a photo's content: its size and evenly spaced blocks, hashed.
+
+    It reads at most 128 KiB, first and last block included. The date plays no part: a copied
+    photo keeps its fingerprint, a changed one does not.
+
+    Raises:
+        BadPhoto: the file cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            size = file.seek(0, os.SEEK_END)
+            digest = hashlib.sha256(str(size).encode())
+            last = max(size - FINGERPRINT_BLOCK_BYTES, 0)
+            for offset in np.unique(np.linspace(0, last, FINGERPRINT_BLOCKS).astype(np.int64)):
+                file.seek(int(offset))
+                digest.update(file.read(FINGERPRINT_BLOCK_BYTES))
+    except OSError as fault:
+        raise BadPhoto(_file_fault(fault)) from fault
+    return digest.hexdigest()
+
+
+def read_header(path: Path) -> PhotoHeader:
+    """Check cheaply that a photo is whole, and return what its header says.
+
+    Found: missing, empty and unreadable files, files that are no photo, photos too small, and
+    JPEG and PNG files that end early (their last marker is missing). Not found: damage inside
+    a file that has its proper end; COLMAP reads such photos, too.
+
+    Raises:
+        BadPhoto: one of these.
+    """
+    return parse_header(read_bytes(path))
+
+
+def read_bytes(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as fault:
+        raise BadPhoto(_file_fault(fault)) from fault
+
+
+def _file_fault(fault: OSError) -> str:
+    if isinstance(fault, FileNotFoundError):
+        return "is missing"
+    return f"cannot be read ({fault.strerror or fault})"
+
+
+def parse_header(data: bytes) -> PhotoHeader:
+    if not data:
+        raise BadPhoto("is empty")
+    try:
+        with Image.open(io.BytesIO(data)) as photo:
+            header = PhotoHeader(photo.width, photo.height, _lens(photo))
+    except UnidentifiedImageError as fault:
+        raise BadPhoto("is not a photo") from fault
+    except (OSError, SyntaxError, ValueError) as fault:
+        raise BadPhoto(f"has a damaged header ({fault})") from fault
+    if is_jpeg(data) and not _jpeg_is_whole(data):
+        raise BadPhoto("is truncated (the JPEG data end early)")
+    if data.startswith(b"\x89PNG") and data.rfind(b"IEND", -4096) < 0:
+        raise BadPhoto("is truncated (the PNG data end early)")
+    if min(header.width, header.height) < MIN_SIDE:
+        raise BadPhoto(f"is only {header.width} x {header.height} pixels")
+    return header
+
+
+def is_jpeg(data: bytes) -> bool:
+    return data.startswith(b"\xff\xd8")
+
+
+def _jpeg_is_whole(data: bytes) -> bool:
+    """Whether the picture's end marker follows its scan; an embedded thumbnail's does not count.
+
+    Decoders fill the missing part of a truncated picture with grey, mostly silently.
+    """
+    if data.endswith(b"\xff\xd9"):
+        return True
+    at = 2
+    while at + 4 <= len(data) and data[at] == 0xFF:
+        if data[at + 1] == 0xDA:
+            # Inside a scan a byte 0xFF is never followed by 0xD9, so the first is the end.
+            return data.find(b"\xff\xd9", at) >= 0
+        if data[at + 1] == 0xFF:
+            at += 1
+        else:
+            at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+    return False
+
+
+def _lens(photo: Image.Image) -> tuple[str, str, float] | None:
+    try:
+        exif = photo.getexif()
+        detail = exif.get_ifd(0x8769)
+        make, model = str(exif[0x010F]).strip("\0 "), str(exif[0x0110]).strip("\0 ")
+        # As COLMAP: the focal length in 35 mm film where given, else the real one.
+        focal = float(detail[0xA405] if 0xA405 in detail else detail[0x920A])
+    except (KeyError, TypeError, ValueError, ArithmeticError, OSError, SyntaxError, struct.error):
+        return None  # no such tags, or broken ones: the pixels may well be whole
+    return (make, model, focal) if make and model else None

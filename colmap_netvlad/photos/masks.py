@@ -1,0 +1,39 @@
+"""Masks in COLMAP's way: areas of a photo that say nothing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_netvlad.photos.files import BadPhoto, read_bytes
+
+
+def find_mask(masks: Path, name: str) -> Path | None:
+    """Return the mask of a photo in COLMAP's way, `<name>.png` or its stem's, or None."""
+    candidates = (masks / f"{name}.png", (masks / name).with_suffix(".png"))
+    return next((mask for mask in candidates if mask.is_file()), None)
+
+
+def neutralise(pixels: NDArray[np.uint8], mask: Path) -> NDArray[np.uint8]:
+    """Return the photo with its masked area (black in the mask) in the mean colour of the rest.
+
+    An even area has no texture for a network to describe. A mask that covers everything leaves
+    an even grey photo.
+
+    Args:
+        pixels: (H, W, 3) uint8.
+        mask: a picture of any size that is stretched over the photo.
+
+    Raises:
+        BadPhoto: the mask cannot be read.
+    """
+    shape = cv2.imdecode(np.frombuffer(read_bytes(mask), np.uint8), cv2.IMREAD_GRAYSCALE)
+    if shape is None:
+        raise BadPhoto(f"has a mask that is no picture ({mask})")
+    size = (pixels.shape[1], pixels.shape[0])
+    seen = cv2.resize(shape, size, interpolation=cv2.INTER_NEAREST) > 0
+    fill = pixels[seen].mean(axis=0) if seen.any() else 128.0
+    return np.where(seen[:, :, None], pixels, np.round(fill)).astype(np.uint8)

@@ -1,0 +1,106 @@
+"""The table of retrieval methods, one file a method."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from colmap_netvlad.cache.ranking import Ranking
+from colmap_netvlad.models.catalogue import CATALOGUE, DEFAULT
+from colmap_netvlad.project import Project
+from colmap_netvlad.retrieval.methods import baselines, bow, deep, hybrid, spatial, vlad
+from colmap_netvlad.retrieval.options import RetrievalOptions
+from colmap_netvlad.runtime.errors import InputError
+
+CHECKPOINT_SUFFIXES = (".safetensors", ".mat")
+
+
+@dataclass(frozen=True)
+class Method:
+    """A retrieval method.
+
+    Attributes:
+        name: what users call it.
+        summary: one line with its source.
+        needs: of "photos", "features", "positions".
+        rank: ranks the images of a project by appearance (or, for `spatial`, by position). Where
+            there is a `model` these are candidates, which are compared place by place then.
+        gps: whether positions join in by themselves.
+        model: the deep model it runs: a name of the catalogue or a checkpoint file.
+    """
+
+    name: str
+    summary: str
+    needs: frozenset[str]
+    rank: Callable[[Project, RetrievalOptions], Ranking]
+    gps: bool = False
+    model: str | Path | None = None
+
+
+def _deep_method(name: str, summary: str, checkpoint: str | Path) -> Method:
+    def rank_deep(project: Project, options: RetrievalOptions) -> Ranking:
+        return deep.rank(project, checkpoint, options)
+
+    return Method(name, summary, frozenset({"photos"}), rank_deep, model=checkpoint)
+
+
+METHODS: dict[str, Method] = {
+    method.name: method
+    for method in (
+        *(_deep_method(entry.name, entry.summary, entry.name) for entry in CATALOGUE.values()),
+        Method(
+            "bow",
+            "COLMAP's vocabulary tree (Schoenberger et al., ACCV 2016).",
+            frozenset({"features"}),
+            bow.rank,
+        ),
+        Method(
+            "vlad",
+            "VLAD on SIFT, 256 words (Jegou et al., CVPR 2010): the paper's baseline.",
+            frozenset({"features"}),
+            vlad.rank,
+        ),
+        Method(
+            "hybrid",
+            "Candidates of the default deep model, VLAD and, where there is any, GPS, compared"
+            " place by place: ours.",
+            frozenset({"photos", "features"}),
+            hybrid.rank,
+            gps=True,
+            model=DEFAULT,
+        ),
+        Method(
+            "spatial",
+            "Nearest on the ground by position priors or GPS, as COLMAP's spatial matcher.",
+            frozenset({"positions"}),
+            spatial.rank,
+        ),
+        Method(
+            "exhaustive",
+            "All pairs; --k is ignored. The reference for sets where it can be afforded.",
+            frozenset(),
+            baselines.exhaustive,
+        ),
+        Method("random", "Partners by chance: the floor.", frozenset(), baselines.chance),
+    )
+}
+
+
+def find_method(name: str | Path) -> Method:
+    """Return a method by name, or one that runs a checkpoint by path.
+
+    Raises:
+        InputError: there is none of that name (suggests the nearest), or no such file.
+    """
+    text = str(name)
+    if text in METHODS:
+        return METHODS[text]
+    path = Path(text)
+    if path.is_file() or path.suffix in CHECKPOINT_SUFFIXES:
+        file = deep.checkpoint_file(path)
+        return _deep_method(file.stem, f"The checkpoint {file}.", file)
+    near = difflib.get_close_matches(text.lower(), METHODS, n=1, cutoff=0.5)
+    hint = f"did you mean {near[0]}?" if near else f"methods are {', '.join(METHODS)}."
+    raise InputError(f"There is no retrieval method {text!r}: {hint}")

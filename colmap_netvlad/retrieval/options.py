@@ -1,0 +1,62 @@
+"""What a user chooses about retrieval."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from colmap_netvlad.runtime.errors import InputError
+
+COMPARED = 100
+"""Candidates of each image that are compared place by place where nothing else is said."""
+
+
+def check_k(k: int, num_images: int) -> int:
+    """Return `k` clamped to the number of possible partners.
+
+    Raises:
+        InputError: `k` is not positive, or there are fewer than two images.
+    """
+    if k < 1:
+        raise InputError(f"--k is {k}; it is the number of partners of each image, at least 1.")
+    if num_images < 2:
+        raise InputError(
+            f"The database has {num_images} image{'s' if num_images != 1 else ''}; "
+            "a pair needs two. Import the photos with `colmap-netvlad features`."
+        )
+    return min(k, num_images - 1)
+
+
+@dataclass(frozen=True)
+class RetrievalOptions:
+    """What a user chooses about retrieval; a method uses what concerns it.
+
+    Attributes:
+        k: partners of each image, at least 1; some methods rank deeper.
+        model: a checkpoint to use instead of the named method.
+        device: where networks run; None takes the fastest there is.
+        seed: of every random choice.
+        batch_size: photos described at once; None: the method's own.
+        vocab_tree: the vocabulary tree of `bow`; None: see `bow.find_tree`.
+        exact: True or False forces exact search or HNSW; None: see `search.EXACT_UP_TO`.
+        masks: folder of masks in COLMAP's way: masked areas are neutral to deep descriptors.
+        gps: whether positions re-weight the candidates, one of `GPS_MODES`; None: "auto" for
+            methods that are not from the literature, else "off".
+        rerank: candidates of each image that deep methods compare place by place
+            (`retrieval.rerank`); 0: none, the global descriptors alone.
+    """
+
+    k: int = 30
+    model: Path | str | None = None
+    device: str | None = None
+    seed: int = 0
+    batch_size: int | None = None
+    vocab_tree: Path | None = None
+    exact: bool | None = None
+    masks: Path | None = None
+    gps: str | None = None
+    rerank: int = COMPARED
+
+
+GPS_MODES = ("auto", "off", "require")
+"""Use positions where there are useful ones, never, or fail where there are none."""

@@ -1,0 +1,154 @@
+"""Run jobs in processes of their own: one that crashes loses its own work only."""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from multiprocessing.connection import Connection, wait
+from multiprocessing.context import SpawnProcess
+from typing import Any
+
+from colmap_netvlad.colmap.engine import silence
+from colmap_netvlad.runtime import progress
+from colmap_netvlad.runtime.errors import InputError
+
+POLL_SECONDS = 0.5
+"""How often progress is looked at."""
+
+KILL_SECONDS = 5.0
+"""How long a worker may take to end when told to."""
+
+KILLED = 9
+"""SIGKILL, which some systems have no name for."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """A module-level function that is called in a worker as `function(advance, *arguments)`.
+
+    `advance(count)` tells the parent that `count` more units are done.
+    """
+
+    function: Callable[..., None]
+    arguments: tuple[Any, ...]
+
+
+@dataclass
+class Outcome:
+    """How a job ended.
+
+    Attributes:
+        fault: why it failed, or None.
+        peak_bytes: the most memory its process held; 0 where it crashed.
+    """
+
+    fault: str | None = None
+    peak_bytes: int = 0
+
+
+def run(
+    jobs: Sequence[Job],
+    workers: int,
+    advance: Callable[[int], None],
+    finished: Callable[[int, Outcome], None] = lambda number, outcome: None,
+) -> list[Outcome]:
+    """Run jobs in at most `workers` processes at a time and return how each ended.
+
+    Args:
+        advance: is told the units done, of all jobs together.
+        finished: is called in this process with a job's number as it ends.
+
+    An exception in this process (Ctrl-C) ends all workers before it goes on.
+    """
+    context = multiprocessing.get_context("spawn")
+    counters = [context.Value("q", 0) for _ in jobs]
+    outcomes = [Outcome() for _ in jobs]
+    running: dict[int, tuple[SpawnProcess, Connection]] = {}
+    waiting = list(range(len(jobs)))[::-1]
+    told = 0
+    try:
+        while waiting or running:
+            while waiting and len(running) < max(1, workers):
+                number = waiting.pop()
+                receiver, sender = context.Pipe(duplex=False)
+                process = context.Process(
+                    target=_work,
+                    args=(jobs[number], counters[number], sender, progress.verbose),
+                )
+                process.start()
+                sender.close()
+                running[number] = process, receiver
+            wait([process.sentinel for process, _ in running.values()], POLL_SECONDS)
+            done = sum(counter.value for counter in counters)
+            advance(done - told)
+            told = done
+            for number, (process, receiver) in list(running.items()):
+                if process.exitcode is None:
+                    continue
+                outcomes[number] = _outcome(process, receiver)
+                del running[number]
+                finished(number, outcomes[number])
+    finally:
+        for process, _ in running.values():
+            process.terminate()
+        for process, _ in running.values():
+            process.join(KILL_SECONDS)
+            if process.exitcode is None:
+                process.kill()
+                process.join()
+    return outcomes
+
+
+def _outcome(process: SpawnProcess, receiver: Connection) -> Outcome:
+    with contextlib.suppress(EOFError), receiver:
+        if receiver.poll():
+            fault, peak = receiver.recv()
+            return Outcome(fault, peak)
+    code = process.exitcode or 0
+    if code == -KILLED:
+        return Outcome("its process was killed, by the system for want of memory perhaps")
+    return Outcome(f"its process crashed (exit code {code})")
+
+
+def _work(job: Job, counter: Any, sender: Connection, verbose: bool) -> None:
+    # Ctrl-C reaches the whole group; the parent alone decides and ends its workers.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+    def advance(count: int = 1) -> None:
+        with counter.get_lock():
+            counter.value += count
+
+    progress.verbose = verbose
+    fault = None
+    try:
+        silence()
+        job.function(advance, *job.arguments)
+    except InputError as known:
+        fault = known.message
+    except Exception as unknown:
+        fault = f"{type(unknown).__name__}: {unknown}"
+    sender.send((fault, _peak_bytes()))
+
+
+def _end_with_parent() -> None:
+    """End this process when its parent is gone (killed, say): nobody waits for the result."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
+def _peak_bytes() -> int:
+    try:
+        import resource
+    except ImportError:  # Windows
+        return 0
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024
