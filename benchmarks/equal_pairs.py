@@ -32,7 +32,7 @@ from colmap_netvlad.pairs.rounds import FITTED, find_candidates, replay, take_tu
 from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval.fusion import similarity_matrix
 from colmap_netvlad.retrieval.options import RetrievalOptions
-from colmap_netvlad.retrieval.rank import rank
+from colmap_netvlad.retrieval.rank import rank_project
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 from fit_rounds import read_scene, truth_of
@@ -83,7 +83,7 @@ def measure(project: Project, k: int, vocab_tree: Path | None) -> None:
     correct_names = correct_pairs(verified_by_name(project.database))
     options = RetrievalOptions(k=len(names) - 1, vocab_tree=vocab_tree)
     rankings = {
-        (method, gps): rank(project, method, replace(options, gps=gps))
+        (method, gps): rank_project(project, method, replace(options, gps=gps))
         for _, method, gps, _ in APPROACHES
     }
     hybrid = rankings["hybrid", "auto"]

@@ -20,7 +20,7 @@ from colmap_netvlad.cli import cli
 from colmap_netvlad.colmap.database import open_database
 from colmap_netvlad.commands import annotate as module
 from colmap_netvlad.commands.annotate import AnnotateOptions, annotate, find_scenes, table_lines
-from colmap_netvlad.demo.render import Flight
+from colmap_netvlad.demo.render import RenderedFlight
 from colmap_netvlad.project import Project
 from colmap_netvlad.runtime.errors import EXIT_PARTIAL, InputError
 from colmap_netvlad.training.scenes import (
@@ -35,14 +35,14 @@ from colmap_netvlad.training.scenes import (
 
 
 @pytest.fixture(scope="module")
-def dataset(flight: Flight, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def dataset(flight: RenderedFlight, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A dataset of one scene, the rendered flight. Read only."""
     folder = tmp_path_factory.mktemp("dataset")
     _link(flight, folder / "village")
     return folder
 
 
-def _link(flight: Flight, scene: Path) -> None:
+def _link(flight: RenderedFlight, scene: Path) -> None:
     (scene / "images").mkdir(parents=True)
     for name in flight.names:
         os.link(flight.images / name, scene / "images" / name)
@@ -166,7 +166,7 @@ def test_bow_pairs_annotate_a_scene_from_its_photos_alone(dataset: Path, tmp_pat
 
 
 def test_what_is_annotated_is_not_done_again_unless_photos_came(
-    flight: Flight,
+    flight: RenderedFlight,
     annotated: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -237,7 +237,7 @@ def test_a_scene_that_does_not_reconstruct_is_named_and_left_out(
 
 
 def test_equal_photos_in_two_scenes_are_found_by_content(
-    flight: Flight, annotated: Path, tmp_path: Path
+    flight: RenderedFlight, annotated: Path, tmp_path: Path
 ) -> None:
     for name in ("one", "two"):
         _link(flight, tmp_path / "data" / name)
@@ -275,7 +275,7 @@ def test_an_annotation_of_another_version_is_refused_and_left_alone(
 
 
 def test_an_annotation_of_other_photos_is_left_alone(
-    flight: Flight, annotated: Path, tmp_path: Path
+    flight: RenderedFlight, annotated: Path, tmp_path: Path
 ) -> None:
     """Two datasets with a scene of one name, annotated into one folder."""
     _link(flight, tmp_path / "other" / "village")

@@ -9,6 +9,7 @@ tell 3.10 from 3.13.
 
 from __future__ import annotations
 
+import hashlib
 import sqlite3
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
@@ -27,6 +28,9 @@ MAX_NUM_IMAGES = 2147483647
 
 BUSY_SECONDS = 5.0
 """How long a read waits for another process's write, s; COLMAP itself waits not at all."""
+
+FINGERPRINT_BYTES = 1024
+"""Bytes of an image's descriptors that tell them from others, 8 SIFT features."""
 
 SIFT_BYTES = 128
 """Bytes of one SIFT descriptor; `descriptors.cols` counts bytes."""
@@ -112,6 +116,21 @@ class Database:
                 "use a method that reads the photos, or extract SIFT."
             )
         return np.frombuffer(row[2], np.uint8).reshape(row[0], SIFT_BYTES)
+
+    def feature_fingerprints(self) -> dict[int, str]:
+        """Return a fingerprint of each image's local descriptors, by image id.
+
+        Of their number, kind and first `FINGERPRINT_BYTES`, so that no descriptor has to be read:
+        features extracted again differ there.
+        """
+        rows = self._connection.execute(
+            "SELECT image_id, rows, cols, substr(data, 1, ?) FROM descriptors WHERE rows > 0",
+            (FINGERPRINT_BYTES,),
+        )
+        return {
+            image_id: hashlib.sha256(b"%d %d " % (count, size) + head).hexdigest()
+            for image_id, count, size, head in rows
+        }
 
     def matched_pairs(self) -> set[tuple[int, int]]:
         """Return the pairs COLMAP's matchers would skip: those with matches and a geometry."""

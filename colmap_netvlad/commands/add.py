@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +19,7 @@ from colmap_netvlad.matching.run import MatchOptions, MatchReport, match_pairs
 from colmap_netvlad.photos.files import find_photos
 from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval.options import RetrievalOptions
-from colmap_netvlad.retrieval.rank import rank
+from colmap_netvlad.retrieval.rank import rank_project
 from colmap_netvlad.runtime.errors import InputError
 
 
@@ -191,13 +191,14 @@ def _new_photos(folder: Path, old: tuple[str, ...]) -> list[str]:
 
 def _pairs_of_new(project: Project, new: set[str], options: AddOptions) -> list[tuple[str, str]]:
     """Return each new photo with its k best partners among the old ones (or among all)."""
-    count = len(image_names(project.database))
-    deeper = min(options.retrieval.k + (0 if options.among_new else len(new)), count - 1)
-    ranking = rank(project, options.method, replace(options.retrieval, k=max(deeper, 1)))
+    k = options.retrieval.k
+    # Where new photos are not to be partners, a list full of them must not be the end of it.
+    least = k if options.among_new else k + len(new)
+    ranking = rank_project(project, options.method, options.retrieval, least)
     pairs: list[tuple[str, str]] = []
     for i, name in enumerate(ranking.names):
         if name in new:
-            partners = _partners(ranking, i, new, options.among_new)[: options.retrieval.k]
+            partners = _partners(ranking, i, new, options.among_new)[:k]
             pairs.extend((name, partner) for partner in partners)
     return pairs
 

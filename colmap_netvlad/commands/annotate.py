@@ -305,15 +305,14 @@ def _matched_database(folder: SceneFolder, database: Path, options: AnnotateOpti
     from colmap_netvlad.matching.run import match_pairs
     from colmap_netvlad.pairs.union import union_of_top
     from colmap_netvlad.project import Project
-    from colmap_netvlad.retrieval.options import RetrievalOptions, check_k
-    from colmap_netvlad.retrieval.rank import rank
+    from colmap_netvlad.retrieval.options import RetrievalOptions
+    from colmap_netvlad.retrieval.rank import rank_project
 
     extract_features(folder.images, database)
-    with open_database(database) as opened:
-        k = check_k(options.k, len(opened.images()))
-    project = Project(database, folder.images)
-    ranking = rank(project, options.method, RetrievalOptions(k=k, seed=options.seed))
-    match_pairs(database, [(pair.name1, pair.name2) for pair in union_of_top(ranking, k)])
+    retrieval = RetrievalOptions(k=options.k, seed=options.seed)
+    ranking = rank_project(Project(database, folder.images), options.method, retrieval)
+    pairs = union_of_top(ranking, options.k)
+    match_pairs(database, [(pair.name1, pair.name2) for pair in pairs])
     return options.method
 
 

@@ -13,7 +13,8 @@ from colmap_netvlad.compare.evidence import Evidence
 from colmap_netvlad.compare.figures import FULL_RANKING, Candidate, compute_figures, gather_evidence
 from colmap_netvlad.compare.models import kept_figures, reconstruct_once
 from colmap_netvlad.compare.result import Comparison, ModelFigures, write_json
-from colmap_netvlad.compare.workspace import ProjectFacts, Workspace, open_workspace, read_facts
+from colmap_netvlad.compare.workspace import Workspace, check_comparable, open_workspace
+from colmap_netvlad.flight import Flight, open_flight
 from colmap_netvlad.graph.pair import Pair, as_pair
 from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.matching.run import MatchOptions
@@ -86,27 +87,33 @@ def compare(
     if not methods:
         raise InputError("No method to compare; name some with --methods bow,vlad,...")
     texts = [_stable_text(text) for text in methods]
-    facts = read_facts(project.database)
-    ks = _checked_ks(options, len(facts.names))
+    with open_flight(project) as flight:
+        return _compare(flight, texts, options, confirm)
+
+
+def _compare(
+    flight: Flight, texts: Sequence[str], options: CompareOptions, confirm: Confirm
+) -> tuple[Comparison, Workspace]:
+    check_comparable(flight)
+    project = flight.project
+    ks = _checked_ks(options, len(flight.names))
     folder = options.output or project.folder / f"{project.database.stem}-compare"
-    workspace = open_workspace(folder, project.database, facts)
+    workspace = open_workspace(folder, flight)
     candidates = _candidates(workspace.add_methods(texts))
     matching = replace(options.matching, seed=options.seed)
     if any(not candidate.ranks for candidate in candidates):
-        _check_cost(workspace, facts, matching, confirm)
+        _check_cost(workspace, flight, matching, confirm)
     for candidate in candidates:
-        _rank(candidate, project, workspace, facts, ks, options)
+        _rank(candidate, flight, workspace, ks, options)
     pairs = {k: {c.name: _pairs(c, k) for c in candidates if c.ranking} for k in ks}
     matched_now = pool.match_once(workspace, pairs[ks[-1]], matching)
     _say_matched(pairs[ks[-1]], matched_now)
-    k = ks[-1] if options.reconstruct_k is None else _clamped(options.reconstruct_k, facts)
+    k = check_k(options.reconstruct_k or ks[-1], len(flight.names))
     for candidate in candidates:
         if candidate.ranking:
             _map(candidate, workspace, project.images, pairs[k][candidate.name], k, options)
-    evidence = gather_evidence(project, workspace, facts, candidates, pairs[ks[-1]])
-    comparison = compute_figures(
-        project, workspace, facts, candidates, pairs, evidence, options.seed
-    )
+    evidence = gather_evidence(flight, workspace, candidates, pairs[ks[-1]])
+    comparison = compute_figures(flight, workspace, candidates, pairs, evidence, options.seed)
     write_report(workspace, comparison, evidence)
     return comparison, workspace
 
@@ -147,10 +154,6 @@ def _checked_ks(options: CompareOptions, images: int) -> tuple[int, ...]:
     return ks
 
 
-def _clamped(k: int, facts: ProjectFacts) -> int:
-    return check_k(k, len(facts.names))
-
-
 def _stable_text(text: str) -> str:
     """Check a method's name, and make the path of a checkpoint absolute, so that it is found
     again from another folder."""
@@ -174,14 +177,14 @@ def _candidates(texts: Sequence[str]) -> list[Candidate]:
 
 
 def _check_cost(
-    workspace: Workspace, facts: ProjectFacts, options: MatchOptions, confirm: Confirm
+    workspace: Workspace, flight: Flight, options: MatchOptions, confirm: Confirm
 ) -> None:
     """Say what exhaustive matching will cost, and ask where that is long."""
-    possible = len(facts.names) * (len(facts.names) - 1) // 2
+    possible = len(flight.names) * (len(flight.names) - 1) // 2
     left = possible - len(pool.matched(workspace))
     if not left:
         return
-    each = pool.measure_cost(workspace, facts.names, options)
+    each = pool.measure_cost(workspace, flight.names, options)
     minutes = each * left / 60
     cost = (
         f"Exhaustive matching: {left:,} pairs, about {minutes:.1f} min "
@@ -194,15 +197,14 @@ def _check_cost(
 
 def _rank(
     candidate: Candidate,
-    project: Project,
+    flight: Flight,
     workspace: Workspace,
-    facts: ProjectFacts,
     ks: tuple[int, ...],
     options: CompareOptions,
 ) -> None:
     if candidate.failed:
         return
-    count = len(facts.names)
+    count = len(flight.names)
     depth = count - 1 if count <= FULL_RANKING else ks[-1]
     retrieval = replace(options.retrieval, k=depth, seed=options.seed)
     try:
@@ -211,7 +213,7 @@ def _rank(
         if kept is None:
             progress.console.print(f"Ranking by {candidate.name}", highlight=False)
             start = time.perf_counter()
-            ranking = rank(project, candidate.text, retrieval).top(depth)
+            ranking = rank(flight, candidate.text, retrieval).top(depth)
             seen = time.perf_counter() - start
             kept = ranking, metrics.efficiency(ranking) > STOLEN_TIME * seen
             workspace.save_ranking(key, *kept)
@@ -224,7 +226,7 @@ def _ranking_key(text: str, options: RetrievalOptions) -> str:
     """Everything a ranking of the same features depends on."""
     method = find_method(text)
     key = f"{text}-k{options.k}-seed{options.seed}"
-    if options.vocab_tree is not None and method.name == "bow":
+    if options.vocab_tree is not None:
         key += f"-{options.vocab_tree.resolve()}-{options.vocab_tree.stat().st_mtime_ns}"
     if method.model is not None:
         key += f"-{deep.model_fingerprint(deep.checkpoint_file(method.model))}"

@@ -18,8 +18,8 @@ from colmap_netvlad.commands.reconstruct import (
 from colmap_netvlad.demo.check import TruthCheck, check_against_truth
 from colmap_netvlad.demo.picture import draw_result
 from colmap_netvlad.demo.render import (
-    Flight,
     FlightOptions,
+    RenderedFlight,
     flight_exists,
     read_flight,
     render_flight,
@@ -94,7 +94,7 @@ def run_demo(
     return check
 
 
-def _flight(folder: Path, options: FlightOptions) -> Flight:
+def _flight(folder: Path, options: FlightOptions) -> RenderedFlight:
     if flight_exists(folder, options):
         flight = read_flight(folder)
         if all((flight.images / name).is_file() for name in flight.names):

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from colmap_netvlad.cache.ranking import Ranking
-from colmap_netvlad.cache.store import Store
-from colmap_netvlad.colmap.database import image_names, open_database
+from colmap_netvlad.flight import open_flight
 from colmap_netvlad.graph.components import component_names, components
 from colmap_netvlad.models.catalogue import CATALOGUE, DEFAULT
 from colmap_netvlad.pairs.connect import apart_lines, connecting_budget, connecting_pairs
 from colmap_netvlad.pairs.lists import FORMATS, read_pairs, write_pairs
 from colmap_netvlad.pairs.rules import (
     PartnerRules,
+    in_order,
     join_pairs,
     sequential_pairs,
     with_camera_quota,
@@ -24,8 +24,7 @@ from colmap_netvlad.pairs.rules import (
 from colmap_netvlad.pairs.union import ImagePair, union_of_top
 from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval.fusion import similarity_matrix
-from colmap_netvlad.retrieval.methods.hybrid import fusion_depth
-from colmap_netvlad.retrieval.options import COMPARED, RetrievalOptions, check_k
+from colmap_netvlad.retrieval.options import COMPARED, RetrievalOptions
 from colmap_netvlad.retrieval.rank import rank
 from colmap_netvlad.runtime.errors import InputError
 
@@ -71,7 +70,7 @@ def make_pairs(
 ) -> PairsReport:
     """Retrieve each image's k nearest partners and write the union as a pairs list.
 
-    Never writes to the user's database. Descriptors, ranks and scores are kept in the project's
+    Never writes to the user's database. Descriptors and what was compared are kept in the project's
     cache, where the photo folder is remembered as well.
 
     Args:
@@ -96,82 +95,48 @@ def make_pairs(
     output = output or project.pairs.with_suffix(SUFFIXES[format])
     _protect(output, project)
     rules.check()
-    names = image_names(project.database)
-    extra = _extra_pairs(names, rules)
-    ranking = _rank_by_rules(project, method, options, rules)
-    pairs = join_pairs(union_of_top(ranking, ranking.depth), extra, names)
-    _remember(project, ranking)
-    found = len(pairs)
-    if connect:
-        pairs = _connect(project, method, options, ranking, pairs)
+    with open_flight(project) as flight:
+        extra = _extra_pairs(flight.names, rules)
+        ranking = rank(flight, method, options)
+        frames = [flight.frames.get(image.image_id) for image in flight.images]
+        cameras = [image.camera_id for image in flight.images]
+        names, has_features = flight.names, bool(flight.descriptors)
+    ranking = without_same_frame(ranking, frames)
+    k = min(options.k, len(names) - 1)
+    chosen = with_camera_quota(ranking, cameras, k, rules.other_cameras)
+    pairs = join_pairs(union_of_top(chosen, k), extra, names)
+    links = _links(ranking, pairs) if connect else []
+    pairs = in_order([*pairs, *links], names)
     unwritable = write_pairs(output, pairs, format)
     colmap_list = None
     if unwritable:
         colmap_list, output = output, output.with_suffix(".csv")
         write_pairs(output, pairs, "csv")
-    with open_database(project.database) as database:
-        has_features = bool(database.descriptor_counts())
     return PairsReport(
-        ranking,
+        chosen,
         pairs,
         component_names(names, [(pair.name1, pair.name2) for pair in pairs]),
         output,
         colmap_list,
         unwritable,
         has_features,
-        len(pairs) - found,
+        len(links),
     )
 
 
-def _rank_by_rules(
-    project: Project, method: str, options: RetrievalOptions, rules: PartnerRules
-) -> Ranking:
-    """Rank, and choose each image's k partners with regard to rig frames and cameras."""
-    with open_database(project.database) as database:
-        images = database.images()
-        frames = database.frames()
-    k = check_k(options.k, len(images))
-    is_rig = len(set(frames.values())) < len(frames)
-    if not is_rig and not rules.other_cameras:
-        ranking = rank(project, method, options)
-        return ranking if ranking.method == "exhaustive" else ranking.top(k)
-    # What the rules take out must be replaced from further down.
-    ranking = _rank_deeply(project, method, options)
-    cameras = [image.camera_id for image in images]
-    return with_camera_quota(ranking, cameras, k, rules.other_cameras)
-
-
-def _rank_deeply(project: Project, method: str, options: RetrievalOptions) -> Ranking:
-    """Rank further down than k, without partners of an image's own rig frame."""
-    with open_database(project.database) as database:
-        images = database.images()
-        frames = database.frames()
-    deeper = replace(options, k=min(fusion_depth(options.k), len(images) - 1))
-    ranking = rank(project, method, deeper)
-    return without_same_frame(ranking, [frames.get(image.image_id) for image in images])
-
-
-def _connect(
-    project: Project,
-    method: str,
-    options: RetrievalOptions,
-    ranking: Ranking,
-    pairs: list[ImagePair],
-) -> list[ImagePair]:
-    """Return the pairs with the best ones between their components added, if there are several."""
+def _links(ranking: Ranking, pairs: Sequence[ImagePair]) -> list[ImagePair]:
+    """Return the best pairs between the components that pairs leave apart, if there are several."""
     names = ranking.names
     index = {name: i for i, name in enumerate(names)}
     chosen = [(index[pair.name1], index[pair.name2]) for pair in pairs]
     component = components(len(names), chosen)
-    if ranking.method == "exhaustive" or not component.any():
-        return pairs
-    deep = _rank_deeply(project, method, options)
-    candidates = {(p.name1, p.name2): p for p in union_of_top(deep, deep.depth)}
+    if ranking.every_pair or not component.any():
+        return []
+    candidates = {(p.name1, p.name2): p for p in union_of_top(ranking, ranking.depth)}
     added = connecting_pairs(
-        similarity_matrix(deep), component, chosen, names, connecting_budget(len(pairs))
+        similarity_matrix(ranking), component, chosen, names, connecting_budget(len(pairs))
     )
-    links = [candidates[names[i], names[j]] for i, j in added]
-    return sorted([*pairs, *links], key=lambda pair: (index[pair.name1], index[pair.name2]))
+    return [candidates[names[i], names[j]] for i, j in added]
 
 
 def _extra_pairs(names: Sequence[str], rules: PartnerRules) -> list[tuple[str, str]]:
@@ -236,12 +201,3 @@ def _protect(output: Path, project: Project) -> None:
     for precious in (project.database, project.cache):
         if output.resolve() == precious.resolve():
             raise InputError(f"--output would overwrite {precious}; name another file.")
-
-
-def _remember(project: Project, ranking: Ranking) -> None:
-    """Keep the ranking and the photo folder, which as part of the workspace moves with it."""
-    with Store(project.cache) as store:
-        if project.images is not None:
-            store.remember_images(project.images)
-        if ranking.method != "exhaustive":  # all pairs in order say nothing worth keeping
-            store.save_ranking(ranking)

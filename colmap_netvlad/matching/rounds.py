@@ -6,7 +6,7 @@ import hashlib
 import json
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,7 @@ from scipy import sparse
 
 from colmap_netvlad.cache.ranking import Ranking
 from colmap_netvlad.cache.store import Store
-from colmap_netvlad.colmap.database import image_names, open_database
+from colmap_netvlad.colmap.database import open_database
 from colmap_netvlad.graph.components import components
 from colmap_netvlad.graph.pair import IndexPair
 from colmap_netvlad.graph.verified import CORRECT_MATCHES
@@ -23,9 +23,8 @@ from colmap_netvlad.pairs.connect import connecting_budget, connecting_pairs
 from colmap_netvlad.pairs.rounds import FITTED, next_round, split_budget
 from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval.fusion import similarity_matrix
-from colmap_netvlad.retrieval.methods.hybrid import fusion_depth
-from colmap_netvlad.retrieval.options import RetrievalOptions, check_k
-from colmap_netvlad.retrieval.rank import rank
+from colmap_netvlad.retrieval.options import RetrievalOptions
+from colmap_netvlad.retrieval.rank import rank_project
 from colmap_netvlad.runtime.errors import InputError
 
 PLAN_SETTING = "rounds"
@@ -107,13 +106,10 @@ def rank_and_match_in_rounds(
         options: `k` sets the budget where none is given: k times the number of images.
 
     Raises:
-        InputError: as `methods.rank` and `match_in_rounds`.
+        InputError: as `rank` and `match_in_rounds`.
     """
-    count = len(image_names(project.database))
-    check_k(options.k, count)
-    deeper = replace(options, k=min(fusion_depth(options.k), count - 1))
-    ranking = rank(project, method, deeper)
-    spend = plan_budget(options.k, count) if budget is None else budget
+    ranking = rank_project(project, method, options)
+    spend = plan_budget(options.k, len(ranking.names)) if budget is None else budget
     return match_in_rounds(project, ranking, spend, rounds, matching)
 
 

@@ -1,7 +1,4 @@
-"""Photos -> pixels: fast reduced-scale decoding, EXIF orientation, batches of equal size.
-
-Nothing here knows about networks: pixels leave as 8-bit RGB, and a model normalises them itself.
-"""
+"""Files of photos: which there are, whether they are whole, what tells them apart."""
 
 from __future__ import annotations
 
@@ -63,6 +60,19 @@ def find_photos(folder: Path) -> list[str]:
             if not name.startswith(".") and Path(name).suffix.lower() in PHOTO_SUFFIXES:
                 names.append(Path(parent, name).relative_to(folder).as_posix())
     return sorted(names)
+
+
+def file_stamp(path: Path) -> str:
+    """Return size and time of a file: while they stay the same, so does what is in it.
+
+    Raises:
+        BadPhoto: the file is not there or cannot be read.
+    """
+    try:
+        status = path.stat()
+    except OSError as fault:
+        raise BadPhoto(_file_fault(fault)) from fault
+    return f"{status.st_size} {status.st_mtime_ns}"
 
 
 def photo_fingerprint(path: Path) -> str:

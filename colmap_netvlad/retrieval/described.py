@@ -4,24 +4,21 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from colmap_netvlad.cache.ranking import NO_PARTNER, Ranking
 from colmap_netvlad.cache.store import Store
+from colmap_netvlad.retrieval.options import RetrievalOptions
 from colmap_netvlad.retrieval.search import nearest
 
-if TYPE_CHECKING:
-    from colmap_netvlad.retrieval.options import RetrievalOptions
 
-
-def missing(store: Store, model: str, photos: Mapping[str, str], local: bool = False) -> list[str]:
+def missing(store: Store, model: str, photos: Mapping[str, str], cells: bool = False) -> list[str]:
     """Return the names in `photos` (name -> fingerprint) that the model has not described yet,
-    or described from another content; with `local`, also those without local features."""
+    or described from another content; with `cells`, also those without cells."""
     known = set(store.described(model).items())
-    if local:
-        known &= set(store.described_locally(model).items())
+    if cells:
+        known &= set(store.described_in_cells(model).items())
     return [name for name, photo in photos.items() if (name, photo) not in known]
 
 
@@ -41,6 +38,7 @@ def rank_described(
     names: Sequence[str],
     left_out: Mapping[str, str],
     options: RetrievalOptions,
+    depth: int,
     method: str,
     notes: Sequence[str] = (),
 ) -> Ranking:
@@ -51,7 +49,8 @@ def rank_described(
         model: fingerprint of the model that described them.
         names: all image names of the project.
         left_out: name -> reason; these have no partners and are nobody's partner.
-        options: k, exact, seed.
+        options: exact, seed.
+        depth: partners of each image.
         method: name for the ranking.
         notes: for the report.
 
@@ -63,7 +62,7 @@ def rank_described(
     described = [names[i] for i in rows]
     start = time.perf_counter()
     found, found_scores = nearest(
-        store.vectors(model, described), options.k, options.exact, options.seed
+        store.vectors(model, described), depth, options.exact, options.seed
     )
     seconds_search = time.perf_counter() - start
     partners = np.full((len(names), found.shape[1]), NO_PARTNER, np.int32)

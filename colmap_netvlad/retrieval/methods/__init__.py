@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from colmap_netvlad.cache.ranking import Ranking
+from colmap_netvlad.flight import Flight
 from colmap_netvlad.models.catalogue import CATALOGUE, DEFAULT
-from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval.methods import baselines, bow, deep, hybrid, spatial, vlad
 from colmap_netvlad.retrieval.options import RetrievalOptions
 from colmap_netvlad.runtime.errors import InputError
@@ -25,25 +25,29 @@ class Method:
         name: what users call it.
         summary: one line with its source.
         needs: of "photos", "features", "positions".
-        rank: ranks the images of a project by appearance (or, for `spatial`, by position). Where
-            there is a `model` these are candidates, which are compared place by place then.
+        candidates: ranks a flight's images by appearance (or, for `spatial`, by position), as many
+            partners of each as it is told. Where there is a `model` these are compared place by
+            place then.
         gps: whether positions join in by themselves.
         model: the deep model it runs: a name of the catalogue or a checkpoint file.
+        takes_model: whether `RetrievalOptions.model` replaces its model; for the others a model
+            given there is a method of its own.
     """
 
     name: str
     summary: str
     needs: frozenset[str]
-    rank: Callable[[Project, RetrievalOptions], Ranking]
+    candidates: Callable[[Flight, RetrievalOptions, int], Ranking]
     gps: bool = False
     model: str | Path | None = None
+    takes_model: bool = False
 
 
 def _deep_method(name: str, summary: str, checkpoint: str | Path) -> Method:
-    def rank_deep(project: Project, options: RetrievalOptions) -> Ranking:
-        return deep.rank(project, checkpoint, options)
+    def candidates(flight: Flight, options: RetrievalOptions, depth: int) -> Ranking:
+        return deep.candidates(flight, options, depth, checkpoint)
 
-    return Method(name, summary, frozenset({"photos"}), rank_deep, model=checkpoint)
+    return Method(name, summary, frozenset({"photos"}), candidates, model=checkpoint)
 
 
 METHODS: dict[str, Method] = {
@@ -54,28 +58,29 @@ METHODS: dict[str, Method] = {
             "bow",
             "COLMAP's vocabulary tree (Schoenberger et al., ACCV 2016).",
             frozenset({"features"}),
-            bow.rank,
+            bow.candidates,
         ),
         Method(
             "vlad",
             "VLAD on SIFT, 256 words (Jegou et al., CVPR 2010): the paper's baseline.",
             frozenset({"features"}),
-            vlad.rank,
+            vlad.candidates,
         ),
         Method(
             "hybrid",
             "Candidates of the default deep model, VLAD and, where there is any, GPS, compared"
             " place by place: ours.",
             frozenset({"photos", "features"}),
-            hybrid.rank,
+            hybrid.candidates,
             gps=True,
             model=DEFAULT,
+            takes_model=True,
         ),
         Method(
             "spatial",
             "Nearest on the ground by position priors or GPS, as COLMAP's spatial matcher.",
             frozenset({"positions"}),
-            spatial.rank,
+            spatial.candidates,
         ),
         Method(
             "exhaustive",
