@@ -10,10 +10,11 @@ from pathlib import Path
 from colmap_netvlad.cache.ranking import Ranking
 from colmap_netvlad.flight import Flight
 from colmap_netvlad.models.catalogue import CATALOGUE, DEFAULT
-from colmap_netvlad.retrieval.methods import baselines, bow, deep, hybrid, spatial, vlad
+from colmap_netvlad.retrieval.methods import baselines, bow, deep, hdf5, hybrid, spatial, vlad
 from colmap_netvlad.retrieval.options import RetrievalOptions
 from colmap_netvlad.runtime.errors import InputError
 
+DESCRIPTOR_SUFFIXES = (".h5", ".hdf5")
 CHECKPOINT_SUFFIXES = (".safetensors", ".mat")
 
 
@@ -48,6 +49,15 @@ def _deep_method(name: str, summary: str, checkpoint: str | Path) -> Method:
         return deep.candidates(flight, options, depth, checkpoint)
 
     return Method(name, summary, frozenset({"photos"}), candidates, model=checkpoint)
+
+
+def _file_method(file: Path) -> Method:
+    def candidates(flight: Flight, options: RetrievalOptions, depth: int) -> Ranking:
+        return hdf5.candidates(flight, options, depth, file)
+
+    summary = f"The global descriptors in {file}, compared place by place by {DEFAULT}."
+    needs = frozenset({"photos"})
+    return Method(file.stem, summary, needs, candidates, model=DEFAULT, takes_model=True)
 
 
 METHODS: dict[str, Method] = {
@@ -94,7 +104,7 @@ METHODS: dict[str, Method] = {
 
 
 def find_method(name: str | Path) -> Method:
-    """Return a method by name, or one that runs a checkpoint by path.
+    """Return a method by name, or one that runs a checkpoint or a file of descriptors by path.
 
     Raises:
         InputError: there is none of that name (suggests the nearest), or no such file.
@@ -103,6 +113,10 @@ def find_method(name: str | Path) -> Method:
     if text in METHODS:
         return METHODS[text]
     path = Path(text)
+    if path.suffix in DESCRIPTOR_SUFFIXES:
+        if not path.is_file():
+            raise InputError(f"The file of descriptors {path} does not exist.")
+        return _file_method(path)
     if path.is_file() or path.suffix in CHECKPOINT_SUFFIXES:
         file = deep.checkpoint_file(path)
         return _deep_method(file.stem, f"The checkpoint {file}.", file)
