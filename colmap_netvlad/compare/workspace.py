@@ -198,11 +198,11 @@ def open_workspace(folder: Path, database: Path, facts: ProjectFacts) -> Workspa
         if kept.get("fingerprint") != facts.fingerprint:
             raise InputError(
                 f"{folder} holds a comparison of another project ({kept.get('database')}), or its "
-                "photos or features have changed since; name another folder with --output."
+                "photos or features have changed since; name another folder with `output`."
             )
     elif folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(
-            f"{folder} exists and is no comparison's folder; name another with --output."
+            f"{folder} exists and is no comparison's folder; name another with `output`."
         )
     else:
         text = json.dumps({"database": str(database), "fingerprint": facts.fingerprint}, indent=1)

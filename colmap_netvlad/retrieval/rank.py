@@ -34,7 +34,7 @@ def rank(project: Project, name: str | Path, options: RetrievalOptions | None = 
     """
     options = options or RetrievalOptions()
     if options.rerank < 0:
-        raise InputError(f"--rerank is {options.rerank}; it is a number of candidates, 0 for none.")
+        raise InputError(f"`rerank` is {options.rerank}; it is a number of candidates, 0 for none.")
     # `hybrid` is told its deep model by --model; for the others a model is the method.
     method = find_method(name if str(name) == "hybrid" else options.model or name)
     count = len(image_names(project.database))
@@ -51,7 +51,7 @@ def rank(project: Project, name: str | Path, options: RetrievalOptions | None = 
         model = deep.model_fingerprint(deep.checkpoint_file(options.model or method.model or ""))
         with Store(project.cache) as store:
             ranking = rerank(ranking, store, model, k, compared)
-        note = f"{compared} candidates of each image compared place by place (--rerank)"
+        note = f"{compared} candidates of each image compared place by place"
         ranking = replace(ranking, notes=(*ranking.notes, note))
     if k < options.k:
         note = f"k lowered from {options.k} to {k}: the project has {count} images"
@@ -67,7 +67,7 @@ def _positions(project: Project, method: Method, options: RetrievalOptions) -> P
     """
     mode = options.gps or ("auto" if method.gps else "off")
     if mode not in GPS_MODES:
-        raise InputError(f"There is no --gps {mode}; choose {', '.join(GPS_MODES)}.")
+        raise InputError(f"`gps` is {mode}; choose {', '.join(GPS_MODES)}.")
     if mode == "off" or "positions" in method.needs:
         return None
     positions = read_positions(project)
@@ -75,6 +75,6 @@ def _positions(project: Project, method: Method, options: RetrievalOptions) -> P
         why = f" {positions.notes[-1]}" if positions.notes else ""
         raise InputError(
             f"Positions are required, but neither {project.database} nor the photos' EXIF have "
-            f"any that tell photos apart.{why} Use --gps auto or off."
+            f"any that tell photos apart.{why} Use `gps` auto or off."
         )
     return positions if positions.useful or positions.notes else None

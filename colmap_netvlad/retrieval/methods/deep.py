@@ -54,7 +54,7 @@ def rank(project: Project, name_or_path: str | Path, options: RetrievalOptions) 
         if len(left_out) == len(names):
             raise InputError(
                 f"None of the {len(names)} photos in {folder} can be used (first: {names[0]} "
-                f"{left_out[names[0]]}); mend --images."
+                f"{left_out[names[0]]}); mend `images`."
             )
         note = cache_note(len(to_do) - len(bad), len(names) - len(left_out))
         method = str(name_or_path) if str(name_or_path) in CATALOGUE else checkpoint.stem
