@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from colmap_netvlad import __version__
+from colmap_netvlad.cli_settings import SettingsCommand
 from colmap_netvlad.runtime.errors import EXIT_PARTIAL
-from colmap_netvlad.training.command import SettingsCommand
+from colmap_netvlad.terminal import VERBOSE, Group, say
 
 if TYPE_CHECKING:
     from colmap_netvlad.matching.run import MatchReport
@@ -119,10 +120,7 @@ def verbose_option(command: Command) -> Command:
     """Add -v, which lets pycolmap's own log through."""
 
     def set_verbosity(context: click.Context, parameter: click.Parameter, verbose: bool) -> None:
-        if not context.resilient_parsing:
-            from colmap_netvlad.runtime import progress
-
-            progress.verbose = verbose
+        context.meta[VERBOSE] = verbose
 
     return click.option(
         "-v",
@@ -135,6 +133,7 @@ def verbose_option(command: Command) -> Command:
 
 
 @click.group(
+    cls=Group,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
 @click.version_option(__version__, "--version", prog_name="colmap-netvlad")
@@ -289,13 +288,13 @@ def reconstruct(
         check_mapper,
         map_and_report,
         report_lines,
-        report_table,
         working_copy,
     )
     from colmap_netvlad.commands.reconstruct import reconstruct as run
     from colmap_netvlad.mapping.options import MappingOptions
     from colmap_netvlad.matching.run import MatchOptions
     from colmap_netvlad.project import find_project
+    from colmap_netvlad.terminal import models_table
 
     check_mapper(mapper)
     project = find_project(database, images)
@@ -315,8 +314,8 @@ def reconstruct(
     else:
         matches = match_and_print_rounds(project, rounds, budget, k, method, device, seed)
         report = map_and_report(project, matches, output, options)
-    Console().print(report_table(report))
-    click.echo("\n".join(report_lines(report)))
+    Console().print(models_table(report))
+    say(*report_lines(report))
     click.echo(f"Matches are in {project.database}, models in {report.output}.")
 
 
@@ -368,8 +367,7 @@ def match(
         f"Pairs: {report.requested:,} ({report.already:,} matched before), {report.verified:,} "
         f"verified, {report.seconds / 60:.1f} minutes. Matches are in {project.database}."
     )
-    for line in view_graph_lines(verified_components(project.database)):
-        click.echo(line)
+    say(*view_graph_lines(verified_components(project.database)))
 
 
 def match_and_print_rounds(
@@ -390,8 +388,7 @@ def match_and_print_rounds(
     spent = rank_and_match_in_rounds(
         project, method, options, rounds, budget, MatchOptions(seed=seed)
     )
-    for line in rounds_lines(spent):
-        click.echo(line)
+    say(*rounds_lines(spent))
     return spent.matches
 
 
@@ -449,9 +446,18 @@ def add(
         method, RetrievalOptions(k=k, device=device, seed=seed), among_new=among_new, seed=seed
     )
     report = add_photos(project, sparse or newest_model(project), options, output)
-    for line in add_lines(report):
-        click.echo(line)
+    say(*add_lines(report))
     finish_partial([f"Left out: {name} {reason}" for name, reason in report.features.bad])
+
+
+def numbers(context: click.Context, parameter: click.Parameter, text: str) -> tuple[int, ...]:
+    """Read `10,20,30`."""
+    try:
+        return tuple(int(part) for part in text.split(",") if part.strip())
+    except ValueError:
+        raise click.ClickException(
+            f"--k is {text!r}; it is a whole number or several with commas, as in --k 10,20,30."
+        ) from None
 
 
 def quoted(path: Path) -> str:
@@ -564,8 +570,7 @@ def pairs(
     )
     rules = PartnerRules(other_cameras, sequential, own_pairs)
     report = make_pairs(project, method or DEFAULT, options, format, output, rules, connect)
-    for line in summary(project, report):
-        click.echo(line)
+    say(*summary(project, report))
     finish_partial([f"Left out: {name} {reason}" for name, reason in report.ranking.left_out])
 
 
@@ -621,11 +626,18 @@ def demo(output: Path, method: str | None, seed: int) -> None:
     from rich.console import Console
 
     from colmap_netvlad.commands.demo import DEMO_FLIGHT, run_demo
+    from colmap_netvlad.commands.reconstruct import ReconstructReport
     from colmap_netvlad.models.catalogue import DEFAULT
+    from colmap_netvlad.terminal import models_table
 
-    console = Console(highlight=False, soft_wrap=True)
+    def tell(item: str | ReconstructReport) -> None:
+        if isinstance(item, str):
+            say(item)
+        else:
+            Console().print(models_table(item))
+
     flight = replace(DEMO_FLIGHT, seed=seed)
-    if not run_demo(output, method or DEFAULT, flight, console.print).passed:
+    if not run_demo(output, method or DEFAULT, flight, tell).passed:
         sys.exit(1)
 
 
@@ -640,8 +652,8 @@ def demo(output: Path, method: str | None, seed: int) -> None:
 )
 @click.option(
     "--k",
-    "ks",
     default="30",
+    callback=numbers,
     show_default=True,
     help="Partners retrieved for each image, one number or several: 10,20,30.",
 )
@@ -652,7 +664,6 @@ def demo(output: Path, method: str | None, seed: int) -> None:
 )
 @click.option(
     "--reconstruct/--no-reconstruct",
-    "build",
     default=True,
     help="Make each method's model, or stop after matching.  [default: make it]",
 )
@@ -661,7 +672,9 @@ def demo(output: Path, method: str | None, seed: int) -> None:
 )
 @click.option("--vocab-tree", type=FILE, help="Vocabulary tree of the method bow.")
 @rerank_option
-@click.option("--yes", is_flag=True, help="Do not ask before a long exhaustive matching.")
+@click.option(
+    "--yes", "confirm", is_flag=True, help="Do not ask before a long exhaustive matching."
+)
 @cache_option
 @device_option
 @seed_option
@@ -670,13 +683,13 @@ def compare(
     database: Path | None,
     images: Path | None,
     methods: str,
-    ks: str,
+    k: tuple[int, ...],
     output: Path | None,
-    build: bool,
+    reconstruct: bool,
     reconstruct_k: int | None,
     vocab_tree: Path | None,
     rerank: int,
-    yes: bool,
+    confirm: bool,
     cache: Path | None,
     device: str | None,
     seed: int,
@@ -688,25 +701,25 @@ def compare(
     killed run goes on where it stopped, and methods can be added in a later run. A method that
     fails is listed at the end, the others finish (exit code 3).
     """
-    from colmap_netvlad.commands.compare import CompareOptions, parse_ks
+    from colmap_netvlad.commands.compare import CompareOptions
     from colmap_netvlad.commands.compare import compare as run
     from colmap_netvlad.project import find_project
-    from colmap_netvlad.report.comparison import print_comparison
     from colmap_netvlad.retrieval.options import RetrievalOptions
+    from colmap_netvlad.terminal import print_comparison
 
-    def confirm(question: str) -> bool:
-        return yes or (sys.stdin.isatty() and click.confirm(question, err=True))
+    def ask(question: str) -> bool:
+        return confirm or (sys.stdin.isatty() and click.confirm(question, err=True))
 
     options = CompareOptions(
-        ks=parse_ks(ks),
+        k=k,
         output=output,
-        reconstruct=build,
+        reconstruct=reconstruct,
         reconstruct_k=reconstruct_k,
         retrieval=RetrievalOptions(device=device, vocab_tree=vocab_tree, rerank=rerank),
         seed=seed,
     )
     names = [name.strip() for name in methods.split(",") if name.strip()]
-    comparison, workspace = run(find_project(database, images, cache), names, options, confirm)
+    comparison, workspace = run(find_project(database, images, cache), names, options, ask)
     print_comparison(comparison)
     click.echo(f"Report: {workspace.html} (figures: {workspace.json.name}, {workspace.csv.name})")
     finish_partial([f"Not finished: {sentence}" for sentence in comparison.incomplete])
@@ -757,8 +770,7 @@ def annotate(
 
     options = annotation.AnnotateOptions(method, k, output, databases, mapper, seed)
     report = annotation.annotate(datasets, options)
-    for line in annotation.table_lines(report.scenes):
-        click.echo(line)
+    say(*annotation.table_lines(report.scenes))
     finish_partial(report.left_out)
 
 
@@ -794,7 +806,7 @@ def train(
     DATASETS are what `annotate` annotated. OUTPUT gets best.safetensors, to be used as
     `--model`, the training curves, and a checkpoint that a stopped run goes on from.
     """
-    from colmap_netvlad.training.command import settings_of
+    from colmap_netvlad.cli_settings import settings_of
     from colmap_netvlad.training.run import report_lines
     from colmap_netvlad.training.run import train as run
     from colmap_netvlad.training.scenes import load_dataset
@@ -803,8 +815,7 @@ def train(
     measured = load_dataset(validation)
     scenes = load_dataset(datasets, (*leave_out, *(scene.name for scene in measured)))
     report = run(scenes, measured, options, output, device=device, name=name)
-    for line in report_lines(report):
-        click.echo(line)
+    say(*report_lines(report))
     finish_partial(report.left_out)
 
 
@@ -812,8 +823,7 @@ def finish_partial(left_out: list[str]) -> None:
     """List on standard error what a finished command left out, and exit with EXIT_PARTIAL."""
     if not left_out:
         return
-    for line in left_out:
-        click.echo(line, err=True)
+    say(*left_out, err=True)
     sys.exit(EXIT_PARTIAL)
 
 

@@ -56,10 +56,10 @@ class Project:
         if self.images is None:
             raise InputError(
                 f"No photo folder is known for {self.database}: there is no "
-                f"{self.folder / 'images'}; say where the photos are with --images."
+                f"{self.folder / 'images'}; say where the photos are with `images`."
             )
         if not self.images.is_dir():
-            raise InputError(f"The photo folder {self.images} does not exist; mend --images.")
+            raise InputError(f"The photo folder {self.images} does not exist; mend `images`.")
         return self.images
 
 
@@ -74,13 +74,13 @@ def locate_database(database: Path | None, folder: Path | None = None) -> Path:
         found = [folder / name for name in DATABASE_NAMES if (folder / name).is_file()]
         if not found:
             raise InputError(
-                f"No {' or '.join(DATABASE_NAMES)} in {folder}; name the database with --db."
+                f"No {' or '.join(DATABASE_NAMES)} in {folder}; name one with `database`."
             )
         return found[0]
     if not database.exists():
-        raise InputError(f"The database {database} does not exist; mend --db.")
+        raise InputError(f"The database {database} does not exist; mend `database`.")
     if database.is_dir():
-        raise InputError(f"{database} is a folder; --db names the database file in it.")
+        raise InputError(f"{database} is a folder; `database` names the database file in it.")
     return database
 
 
@@ -100,7 +100,7 @@ def open_project(
     database = locate_database(database)
     if images is not None:
         if not images.is_dir():
-            raise InputError(f"The photo folder {images} does not exist; mend --images.")
+            raise InputError(f"The photo folder {images} does not exist; mend `images`.")
         return Project(database, images)
     for folder in (remembered, database.parent / "images"):
         if folder is not None and folder.is_dir():

@@ -27,7 +27,7 @@ from colmap_netvlad.runtime.errors import EXIT_PARTIAL, InputError
 
 METHODS = ("vlad", "random")
 # One thread: COLMAP adds in the order its threads finish, so only that repeats the last digits.
-OPTIONS = CompareOptions(ks=(2, 4), mapping=MappingOptions(threads=1))
+OPTIONS = CompareOptions(k=(2, 4), mapping=MappingOptions(threads=1))
 FAST = replace(OPTIONS, reconstruct=False)
 
 Make = Callable[..., Project]
@@ -288,7 +288,7 @@ def test_a_long_exhaustive_matching_is_asked_about(no_page, project_copy: Make, 
     project = project_copy()
     monkeypatch.setattr(pipeline, "ASK_ABOVE", 0.0)
     asked = []
-    with pytest.raises(InputError, match=r"about .* min .*--yes"):
+    with pytest.raises(InputError, match=r"about .* min .*`confirm`"):
         compare(project, ["exhaustive"], FAST, lambda question: bool(asked.append(question)))
     assert "42 pairs" in asked[0] or "66 pairs" in asked[0]
     comparison, _ = compare(project, ["exhaustive"], FAST, lambda question: True)

@@ -203,11 +203,11 @@ def test_gps_of_photos_reaches_the_database(images: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        ({"camera": "stereo"}, "--camera is stereo; choose auto"),
+        ({"camera": "stereo"}, "`camera` is stereo; choose auto"),
         ({"camera_model": "LENS"}, "no camera model LENS"),
-        ({"max_image_size": 0}, "--max-image-size is 0"),
-        ({"max_features": -1}, "--max-features is -1"),
-        ({"threads": 0}, "--threads is 0"),
+        ({"max_image_size": 0}, "`max_image_size` is 0"),
+        ({"max_features": -1}, "`max_features` is -1"),
+        ({"threads": 0}, "`threads` is 0"),
         ({"masks": Path("nowhere")}, "mask folder nowhere does not exist"),
     ],
 )

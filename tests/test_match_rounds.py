@@ -122,7 +122,7 @@ def test_a_ranking_of_other_images_is_one_sentence(
 
 
 @pytest.mark.parametrize(
-    ("budget", "rounds", "said"), [(5, 3, "at least 6"), (18, 0, "--rounds is 0")]
+    ("budget", "rounds", "said"), [(5, 3, "at least 6"), (18, 0, "`rounds` is 0")]
 )
 def test_too_small_a_budget_is_one_sentence_and_matches_nothing(
     flight_ranking: tuple[Project, Ranking], budget: int, rounds: int, said: str

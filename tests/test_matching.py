@@ -142,9 +142,9 @@ def test_a_failing_process_is_said_and_leaves_what_is_matched(
     monkeypatch.setattr(matching, "BLOCK", 5)
     run = workers.run
 
-    def without_the_second_folder(jobs: list[workers.Job], *others: Any) -> Any:
+    def without_the_second_folder(jobs: list[workers.Job], *others: Any, **options: Any) -> Any:
         jobs[1].arguments[1].rmdir()
-        return run(jobs, *others)
+        return run(jobs, *others, **options)
 
     monkeypatch.setattr(workers, "run", without_the_second_folder)
     with pytest.raises(InputError, match="run the command again"):

@@ -93,7 +93,7 @@ def test_a_checkpoint_by_path_is_a_method(project_copy: MakeProject, checkpoint:
     assert ranking.method == "tiny"
     assert ranking.notes == (
         "12 of 12 descriptors computed",
-        "11 candidates of each image compared place by place (--rerank)",
+        "11 candidates of each image compared place by place",
     )
     assert ranking.seconds_describe > 0
 
@@ -158,7 +158,7 @@ def test_no_usable_photo_at_all_is_one_sentence(
 ) -> None:
     (tmp_path / "empty").mkdir()
     project = replace(project_copy(), images=tmp_path / "empty")
-    with pytest.raises(InputError, match=r"None of the 12 photos .*is missing.*--images"):
+    with pytest.raises(InputError, match=r"None of the 12 photos .*is missing.*`images`"):
         rank(project, checkpoint)
 
 
@@ -259,7 +259,7 @@ def test_k_above_the_number_of_images_is_lowered_with_a_note(project_copy: MakeP
 
 @pytest.mark.parametrize("k", [0, -3])
 def test_k_below_one_is_refused(k: int, project_copy: MakeProject) -> None:
-    with pytest.raises(InputError, match=f"--k is {k}"):
+    with pytest.raises(InputError, match=f"`k` is {k}"):
         rank(project_copy(), "random", RetrievalOptions(k=k))
 
 

@@ -308,7 +308,7 @@ def test_weights_not_shipped_say_where_to_get_and_where_to_put_them(tmp_path, mo
         load_model("netvlad")
     assert "Pitts30K_struct.mat" in fault.value.message
     assert str(tmp_path / "hub" / "checkpoints") in fault.value.message
-    assert "--model" in fault.value.message
+    assert "`model`" in fault.value.message
 
 
 @pytest.mark.parametrize("variable", ["TORCH_HOME", "XDG_CACHE_HOME", None])

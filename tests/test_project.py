@@ -37,14 +37,14 @@ def test_the_remembered_photo_folder_comes_before_images_beside_the_database(
 def test_without_photos_a_project_opens_and_says_so_when_they_are_needed(tmp_path: Path) -> None:
     (tmp_path / "project.db").touch()
     project = open_project(tmp_path / "project.db")
-    with pytest.raises(InputError, match="--images"):
+    with pytest.raises(InputError, match="`images`"):
         project.need_images()
 
 
 @pytest.mark.parametrize(
     ("database", "images", "message"),
     [
-        (None, None, "name the database with --db"),
+        (None, None, "name one with `database`"),
         ("absent.db", None, r"absent\.db does not exist"),
         (".", None, "is a folder"),
         ("there.db", "nowhere", "photo folder .*nowhere does not exist"),

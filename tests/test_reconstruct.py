@@ -23,7 +23,6 @@ from colmap_netvlad.commands.reconstruct import (
     map_and_report,
     reconstruct,
     report_lines,
-    report_table,
     working_copy,
 )
 from colmap_netvlad.mapping.incremental import map_incremental
@@ -32,6 +31,7 @@ from colmap_netvlad.mapping.summary import ModelSummary, combine, registered_nam
 from colmap_netvlad.matching.run import MatchReport
 from colmap_netvlad.project import Project
 from colmap_netvlad.runtime.errors import InputError
+from colmap_netvlad.terminal import models_table
 
 MakeProject = Callable[..., Project]
 MATCHED = MatchReport(requested=66, already=66, matched=0, verified=50, seconds=0.0)
@@ -204,8 +204,8 @@ def test_the_report_shows_each_component_and_the_total(tmp_path: Path) -> None:
     report = ReconstructReport(
         tmp_path, 20, MATCHED, [model], model, [f"{i}.jpg" for i in range(15)], {"matching": 90.0}
     )
-    assert report_table(report).row_count == 1
-    assert report_table(replace(report, models=[model, model])).row_count == 3
+    assert models_table(report).row_count == 1
+    assert models_table(replace(report, models=[model, model])).row_count == 3
     text = "\n".join(report_lines(report))
     assert "15 of 20 images: 0.jpg" in text and "9.jpg, ..." in text and "10.jpg" not in text
     assert "matching 1.5" in text

@@ -20,11 +20,12 @@ from colmap_netvlad.compare.figures import retrieval_figures
 from colmap_netvlad.compare.finds import single_finds
 from colmap_netvlad.compare.result import MethodResult, ModelFigures, RetrievalFigures
 from colmap_netvlad.graph.pair import as_pair
-from colmap_netvlad.report.comparison import print_comparison, write_csv
+from colmap_netvlad.report.comparison import write_csv
 from colmap_netvlad.report.examples import choose_examples, hardest_images
 from colmap_netvlad.report.layout import align, from_above, lay_out, similarity
 from colmap_netvlad.report.measures import MEASURES, seconds
 from colmap_netvlad.report.page import render_page
+from colmap_netvlad.terminal import print_comparison
 
 
 @pytest.fixture(scope="module")

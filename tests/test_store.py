@@ -119,7 +119,7 @@ def test_another_sqlite_file_is_never_taken_for_a_cache(cache: Path) -> None:
 
 
 def test_a_place_that_cannot_be_written_is_said_with_the_way_out(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="--cache"):
+    with pytest.raises(InputError, match="`cache`"):
         Store(tmp_path / "no such folder" / "project.netvlad.db")
 
 

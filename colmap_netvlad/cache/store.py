@@ -295,14 +295,14 @@ class Store:
         tables = self._pragma("schema_version")
         if application != APPLICATION and tables:
             raise InputError(
-                f"{self.path} is not a cache of colmap-netvlad; name another file with --cache."
+                f"{self.path} is not a cache of colmap-netvlad; name another file with `cache`."
             )
         version = self._pragma("user_version")
         if tables and version not in READ_FORMATS:
             raise InputError(
                 f"The cache {self.path} has format {version}, this version of colmap-netvlad reads "
                 f"format {FORMAT}; delete the file (it is made again), or name another with "
-                "--cache."
+                "`cache`."
             )
         if not tables:
             # Large pages: a descriptor of 64 KiB then lies in few of them.
@@ -427,5 +427,5 @@ def _sentence(path: Path, fault: str) -> str:
     folder = "" if os.access(path.parent, os.W_OK) else " (the folder cannot be written)"
     return (
         f"Cannot use the cache {path}: {fault}{folder}; name a file in a folder that can be "
-        "written with --cache."
+        "written with `cache`."
     )

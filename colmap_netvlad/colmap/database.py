@@ -233,7 +233,7 @@ def open_database(path: Path) -> Iterator[Database]:
 
 def _connect(path: Path) -> sqlite3.Connection:
     if not path.is_file():
-        raise InputError(f"The database {path} does not exist; mend --db.")
+        raise InputError(f"The database {path} does not exist; mend `database`.")
     uri = path.resolve().as_uri()
     wal = path.with_name(path.name + "-wal")
     # A WAL database at rest is opened for writing and then only queried: a read-only connection

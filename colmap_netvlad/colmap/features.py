@@ -144,24 +144,21 @@ class _Group:
 
 def _check_input(images: Path, options: FeatureOptions) -> list[str]:
     if not images.is_dir():
-        raise InputError(f"The photo folder {images} does not exist; mend --images.")
+        raise InputError(f"The photo folder {images} does not exist; mend `images`.")
     if options.camera not in CAMERA_MODES:
-        raise InputError(f"--camera is {options.camera}; choose {', '.join(CAMERA_MODES)}.")
+        raise InputError(f"`camera` is {options.camera}; choose {', '.join(CAMERA_MODES)}.")
     if options.camera_model not in pycolmap.CameraModelId.__members__:
-        raise InputError(f"COLMAP has no camera model {options.camera_model}; mend --camera-model.")
+        raise InputError(f"COLMAP has no camera model {options.camera_model}; mend `camera_model`.")
     if options.masks is not None and not options.masks.is_dir():
-        raise InputError(f"The mask folder {options.masks} does not exist; mend --masks.")
-    for value, option in (
-        (options.max_image_size, "--max-image-size"),
-        (options.max_features, "--max-features"),
-        (options.threads, "--threads"),
-    ):
+        raise InputError(f"The mask folder {options.masks} does not exist; mend `masks`.")
+    for name in ("max_image_size", "max_features", "threads"):
+        value = getattr(options, name)
         if value is not None and value < 1:
-            raise InputError(f"{option} is {value}; it must be at least 1.")
+            raise InputError(f"`{name}` is {value}; it must be at least 1.")
     names = find_photos(images)
     if not names:
         raise InputError(
-            f"There are no photos in {images} ({' '.join(sorted(PHOTO_SUFFIXES))}); mend --images."
+            f"There are no photos in {images} ({' '.join(sorted(PHOTO_SUFFIXES))}); mend `images`."
         )
     return names
 
@@ -236,7 +233,7 @@ def _group(
             (first, a), (second, b) = list(sizes.items())[:2]
             raise InputError(
                 f"Photos of one camera must have one size, but {a} has {first[0]} x {first[1]} "
-                f"pixels and {b} {second[0]} x {second[1]}; use --camera auto."
+                f"pixels and {b} {second[0]} x {second[1]}; use `camera` auto."
             )
         camera_id = row.camera_id if row is not None else None
         groups.append(_Group(pycolmap.CameraMode.SINGLE, camera_id, names))

@@ -148,7 +148,7 @@ def add_lines(report: AddReport) -> list[str]:
         lines.append(
             f"Not registered: {', '.join(report.unregistered[:10])}"
             f"{', ...' if len(report.unregistered) > 10 else ''}; photos that overlap only other "
-            "new ones need --among-new, or `pairs` and `reconstruct` anew."
+            "new ones need `among_new`, or new pairs and a new model."
         )
     return [*lines, f"The extended model is in {report.output}."]
 
@@ -164,7 +164,7 @@ def newest_model(project: Project) -> Path:
     if not models:
         raise InputError(
             f"There is no model in {project.sparse}; run `colmap-netvlad reconstruct`, or name "
-            "one with --sparse."
+            "one with `sparse`."
         )
     return max(models, key=lambda model: _number(model.parent.name))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -20,7 +21,6 @@ from colmap_netvlad.photos.files import (
     read_header,
 )
 from colmap_netvlad.runtime.errors import InputError
-from colmap_netvlad.runtime.progress import console
 from colmap_netvlad.training.scenes import (
     ANNOTATION,
     Observations,
@@ -32,6 +32,8 @@ from colmap_netvlad.training.scenes import (
     symmetric,
 )
 from colmap_netvlad.training.tracks import tracks
+
+logger = logging.getLogger(__name__)
 
 if TYPE_CHECKING:
     import pycolmap
@@ -131,7 +133,7 @@ def annotate(datasets: Sequence[Path], options: AnnotateOptions) -> AnnotateRepo
         known = ", ".join((*MAPPERS, NO_MAPPER))
         raise InputError(f"No mapper is called {options.mapper!r}: there are {known}.")
     for folder in find_scenes(datasets):
-        console.print(f"Scene {folder.name}", highlight=False)
+        logger.info("Scene %s", folder.name)
         try:
             scene = annotate_scene(folder, options)
             check_disjoint([*report.scenes, scene])
@@ -155,7 +157,7 @@ def annotate_scene(folder: SceneFolder, options: AnnotateOptions) -> Scene:
         scene = load_annotation(path)
         if scene.images.resolve() != folder.images.resolve():
             raise InputError(
-                f"{path} is the annotation of other photos ({scene.images}); give another --output."
+                f"{path} is the annotation of other photos ({scene.images}); give another `output`."
             )
         if _is_current(scene, photos):
             return scene

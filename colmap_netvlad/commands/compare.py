@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -23,9 +24,10 @@ from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval.methods import deep, find_method
 from colmap_netvlad.retrieval.options import RetrievalOptions, check_k
 from colmap_netvlad.retrieval.rank import rank
-from colmap_netvlad.runtime import progress
 from colmap_netvlad.runtime.errors import InputError
 from colmap_netvlad.runtime.files import write_atomically
+
+logger = logging.getLogger(__name__)
 
 ASK_ABOVE = 600.0
 """Exhaustive matching that is estimated to take longer than this, s, is asked about first."""
@@ -41,17 +43,17 @@ class CompareOptions:
     """What a user chooses about a comparison.
 
     Attributes:
-        ks: numbers of partners to compare; clamped to the number of other images.
+        k: numbers of partners to compare; clamped to the number of other images.
         output: the comparison's folder; None: `<database>-compare` beside the database.
         reconstruct: whether each method's model is made; one made earlier is shown in any case.
-        reconstruct_k: the number of partners the models are made from, one of `ks`; None: the
+        reconstruct_k: the number of partners the models are made from, one of `k`; None: the
             largest.
         retrieval: device, vocabulary tree; its k and seed are set from here.
         seed: of every method, of verification and of mapping.
         matching, mapping: their other options.
     """
 
-    ks: tuple[int, ...] = (30,)
+    k: tuple[int, ...] = (30,)
     output: Path | None = None
     reconstruct: bool = True
     reconstruct_k: int | None = None
@@ -85,7 +87,7 @@ def compare(
             this project's comparison, or exhaustive matching that was not confirmed.
     """
     if not methods:
-        raise InputError("No method to compare; name some with --methods bow,vlad,...")
+        raise InputError("No method to compare; name some in `methods`, bow and vlad for example.")
     texts = [_stable_text(text) for text in methods]
     with open_flight(project) as flight:
         return _compare(flight, texts, options, confirm)
@@ -118,20 +120,6 @@ def _compare(
     return comparison, workspace
 
 
-def parse_ks(text: str) -> tuple[int, ...]:
-    """Read `10,20,30`.
-
-    Raises:
-        InputError: it is not a list of whole numbers.
-    """
-    try:
-        return tuple(int(part) for part in text.split(",") if part.strip())
-    except ValueError:
-        raise InputError(
-            f"--k is {text!r}; it is a whole number or several with commas, as in --k 10,20,30."
-        ) from None
-
-
 def write_report(workspace: Workspace, comparison: Comparison, evidence: Evidence) -> None:
     """Write `compare.json`, `compare.csv` and `compare.html`."""
     from colmap_netvlad.report.comparison import write_csv
@@ -143,13 +131,13 @@ def write_report(workspace: Workspace, comparison: Comparison, evidence: Evidenc
 
 
 def _checked_ks(options: CompareOptions, images: int) -> tuple[int, ...]:
-    if not options.ks:
-        raise InputError("--k names no number of partners; give one or several: --k 10,20,30.")
-    ks = tuple(sorted({check_k(k, images) for k in options.ks}))
+    if not options.k:
+        raise InputError("`k` names no number of partners; give one or several.")
+    ks = tuple(sorted({check_k(k, images) for k in options.k}))
     wanted = options.reconstruct_k
     if wanted is not None and check_k(wanted, images) not in ks:
         raise InputError(
-            f"--reconstruct-k is {wanted}, which is not one of --k {', '.join(map(str, ks))}."
+            f"`reconstruct_k` is {wanted}, which is not one of `k`: {', '.join(map(str, ks))}."
         )
     return ks
 
@@ -190,9 +178,9 @@ def _check_cost(
         f"Exhaustive matching: {left:,} pairs, about {minutes:.1f} min "
         f"({each:.3f} s a pair, measured on {min(pool.SAMPLE, possible)})."
     )
-    progress.console.print(cost, highlight=False)
+    logger.info(cost)
     if minutes * 60 > ASK_ABOVE and not confirm(f"{cost} Go on?"):
-        raise InputError(f"{cost} Say --yes, or leave the method exhaustive out.")
+        raise InputError(f"{cost} Say so with `confirm`, or leave the method exhaustive out.")
 
 
 def _rank(
@@ -211,7 +199,7 @@ def _rank(
         key = _ranking_key(candidate.text, retrieval)
         kept = workspace.load_ranking(key)
         if kept is None:
-            progress.console.print(f"Ranking by {candidate.name}", highlight=False)
+            logger.info("Ranking by %s", candidate.name)
             start = time.perf_counter()
             ranking = rank(flight, candidate.text, retrieval).top(depth)
             seen = time.perf_counter() - start
@@ -243,10 +231,9 @@ def _pairs(candidate: Candidate, k: int) -> set[Pair]:
 def _say_matched(pairs: Mapping[str, set[Pair]], now: int) -> None:
     distinct = len(set().union(*pairs.values()))
     asked = sum(map(len, pairs.values()))
-    progress.console.print(
+    logger.info(
         f"Matched each distinct pair once: {distinct:,} pairs for {asked:,} asked by "
-        f"{len(pairs)} methods, {now:,} of them now.",
-        highlight=False,
+        f"{len(pairs)} methods, {now:,} of them now."
     )
 
 
@@ -263,7 +250,7 @@ def _map(
     candidate.model = kept_figures(folder, pairs, k, mapping)
     if candidate.model or not options.reconstruct:
         return
-    progress.console.print(f"Mapping {candidate.name}", highlight=False)
+    logger.info("Mapping %s", candidate.name)
     try:
         candidate.model = reconstruct_once(workspace.union, images, folder, pairs, k, mapping)
     except Exception as fault:  # whatever stops one method leaves the others

@@ -200,4 +200,4 @@ def _next_command(project: Project, report: PairsReport) -> str:
 def _protect(output: Path, project: Project) -> None:
     for precious in (project.database, project.cache):
         if output.resolve() == precious.resolve():
-            raise InputError(f"--output would overwrite {precious}; name another file.")
+            raise InputError(f"`output` would overwrite {precious}; name another file.")

@@ -7,8 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from rich.table import Table
-
 from colmap_netvlad.colmap.database import copy_database, open_database
 from colmap_netvlad.graph.verified import verified_components
 from colmap_netvlad.mapping import MAPPERS
@@ -120,7 +118,7 @@ def map_and_report(
     if not models:
         raise InputError(
             f"No model came out of {matches.verified} verified pairs: none has enough inliers and "
-            "baseline to start from. More pairs (--k) or more overlap may help."
+            "baseline to start from. More pairs (`k`) or more overlap may help."
         )
     registered = registered_names(models)
     with open_database(project.database) as colmap:
@@ -158,28 +156,8 @@ def check_mapper(name: str) -> None:
         raise InputError(f"There is no mapper {name}; choose {', '.join(MAPPERS)}.")
 
 
-def report_table(report: ReconstructReport) -> Table:
-    """Return the figures of every component, and in total where there are several."""
-    table = Table(title=f"Sparse model in {report.output}", title_justify="left")
-    table.add_column("Component")
-    for column in (
-        "Registered\nimages",
-        "3D points",
-        "Mean reprojection\nerror (px)",
-        "Mean track\nlength",
-        "Observations",
-    ):
-        table.add_column(column, justify="right", no_wrap=True)
-    for index, model in enumerate(report.models):
-        table.add_row(str(index), *_cells(model, report.images))
-    if len(report.models) > 1:
-        table.add_section()
-        table.add_row("total", *_cells(report.total, report.images))
-    return table
-
-
 def report_lines(report: ReconstructReport) -> list[str]:
-    """Return what stands below the table: pairs, minutes of each stage, images left out."""
+    """Return the report in lines: pairs, minutes of each stage, images left out."""
     matches = report.matches
     lines = [
         f"Pairs: {matches.requested:,} ({matches.already:,} matched before, "
@@ -203,19 +181,9 @@ def view_graph_lines(groups: Sequence[Sequence[str]]) -> list[str]:
         return []
     return [
         f"View graph: {len(groups)} components; apart from the largest of {len(groups[0]):,} "
-        "images are (a larger --k, or --rounds, may join them):",
+        "images are (a larger `k`, or `rounds`, may join them):",
         *(f"  {line}" for line in apart_lines(groups)),
     ]
-
-
-def _cells(model: ModelSummary, images: int) -> tuple[str, ...]:
-    return (
-        f"{model.registered:,} of {images:,}",
-        f"{model.points:,}",
-        f"{model.mean_reprojection_error:.3f}",
-        f"{model.mean_track_length:.2f}",
-        f"{model.observations:,}",
-    )
 
 
 def _first(names: Sequence[str]) -> str:
@@ -227,7 +195,7 @@ def _existing(pairs: Path) -> Path:
     if not pairs.is_file():
         raise InputError(
             f"There is no pairs list {pairs}; make it with `colmap-netvlad pairs`, or name one "
-            "with --pairs."
+            "with `pairs`."
         )
     return pairs
 

@@ -184,11 +184,11 @@ def open_workspace(folder: Path, flight: Flight) -> Workspace:
         if kept.get("fingerprint") != fingerprint:
             raise InputError(
                 f"{folder} holds a comparison of another project ({kept.get('database')}), or its "
-                "photos or features have changed since; name another folder with --output."
+                "photos or features have changed since; name another folder with `output`."
             )
     elif folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(
-            f"{folder} exists and is no comparison's folder; name another with --output."
+            f"{folder} exists and is no comparison's folder; name another with `output`."
         )
     else:
         text = json.dumps({"database": str(database), "fingerprint": fingerprint}, indent=1)

@@ -24,7 +24,7 @@ def read_model(folder: Path) -> pycolmap.Reconstruction:
         return pycolmap.Reconstruction(folder)
     except (ValueError, RuntimeError, OSError) as fault:
         raise InputError(
-            f"{folder} is not a COLMAP model (cameras, images, points3D); name one with --model."
+            f"{folder} is not a COLMAP model (cameras, images, points3D); name one with `sparse`."
         ) from fault
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import math
 import os
 import shutil
@@ -19,6 +20,7 @@ from pathlib import Path
 
 import pycolmap
 
+from colmap_netvlad.colmap import engine
 from colmap_netvlad.graph.viewgraph import ViewGraph, read_view_graph
 from colmap_netvlad.mapping.incremental import pipeline_options
 from colmap_netvlad.mapping.merge import merge, read_sub_model
@@ -31,6 +33,8 @@ from colmap_netvlad.runtime import progress, workers
 from colmap_netvlad.runtime.errors import InputError
 from colmap_netvlad.runtime.files import write_atomically
 from colmap_netvlad.runtime.machine import usable_processors
+
+logger = logging.getLogger(__name__)
 
 CLUSTER_IMAGES = 250
 """Default size of a cluster before it is expanded (measured, see docs/parallel-sfm.md)."""
@@ -98,7 +102,7 @@ def map_parallel(
 ) -> list[pycolmap.Reconstruction]:
     """Reconstruct a large flight in clusters and write `output`/0, 1, ...
 
-    What was left out (failed clusters, refused sub-models) is said on standard error;
+    What was left out (failed clusters, refused sub-models) is logged;
     `reconstruct_parallel` returns it.
 
     Args:
@@ -116,7 +120,7 @@ def map_parallel(
     """
     models, report = reconstruct_parallel(database, images, output, options)
     for line in report_lines(report):
-        progress.console.print(line, highlight=False, markup=False)
+        logger.warning(line)
     return models
 
 
@@ -214,7 +218,7 @@ def map_clusters(
     try:
         with progress.step(f"Mapping {len(clusters)} clusters", total) as bar:
             bar.advance(total - sum(len(clusters[number].images) for number in todo))
-            workers.run(jobs, count, bar.advance, finished)
+            workers.run(jobs, count, bar.advance, finished, engine.initialiser())
     finally:
         for part in parts.values():
             shutil.rmtree(part, ignore_errors=True)
@@ -280,7 +284,7 @@ def merge_clusters(
                 options,
             ),
         )
-        (outcome,) = workers.run([job], 1, bar.advance)
+        (outcome,) = workers.run([job], 1, bar.advance, initialiser=engine.initialiser())
     report.peak_bytes = max(report.peak_bytes, outcome.peak_bytes)
     if outcome.fault is not None:
         raise InputError(

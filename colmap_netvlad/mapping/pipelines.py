@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable
 from pathlib import Path
 
 import pycolmap
 
+from colmap_netvlad.colmap import engine
 from colmap_netvlad.colmap.database import open_database
 from colmap_netvlad.mapping.incremental import map_incremental, pipeline_options
 from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.mapping.output import model_folder
 from colmap_netvlad.mapping.parallel import CLUSTER_IMAGES, map_parallel
-from colmap_netvlad.runtime import progress, workers
+from colmap_netvlad.runtime import workers
 from colmap_netvlad.runtime.errors import InputError
+
+logger = logging.getLogger(__name__)
 
 PARALLEL_IMAGES = 500
 """From this many images with features on, parallel mapping is chosen (measured, see
@@ -101,9 +105,9 @@ def _map(
 ) -> list[pycolmap.Reconstruction]:
     """Run a mapper that cannot be cancelled in a worker, which Ctrl-C ends."""
     with model_folder(output) as folder:
-        progress.console.print(f"Mapping {how}; COLMAP tells no progress of this mapper.")
+        logger.info("Mapping %s; COLMAP tells no progress of this mapper.", how)
         job = workers.Job(function, (database, images, folder, options))
-        (outcome,) = workers.run([job], 1, lambda count: None)
+        (outcome,) = workers.run([job], 1, lambda count: None, initialiser=engine.initialiser())
         if outcome.fault is not None:
             raise InputError(f"COLMAP could not map {how}: {outcome.fault}.")
         return [pycolmap.Reconstruction(path) for path in sorted(folder.iterdir()) if path.is_dir()]

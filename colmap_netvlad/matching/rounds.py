@@ -172,12 +172,12 @@ def _check(project: Project, ranking: Ranking, budget: int, rounds: int) -> dict
             f"{project.database}; make it from this database."
         )
     if rounds < 1:
-        raise InputError(f"--rounds is {rounds}; it must be at least 1.")
+        raise InputError(f"`rounds` is {rounds}; it must be at least 1.")
     least = (len(ids) + 1) // 2
     if budget < least:
         raise InputError(
             f"The budget of {budget} pairs is too small: {len(ids)} images need at least "
-            f"{least} for each to be in one pair; raise --k or --budget."
+            f"{least} for each to be in one pair; raise `k` or `budget`."
         )
     return ids
 

@@ -160,7 +160,7 @@ def _match_all(
         if count == 1:
             _match_in_chunks(advance, *jobs[0].arguments)
             return
-        for outcome in workers.run(jobs, count, advance):
+        for outcome in workers.run(jobs, count, advance, initialiser=engine.initialiser()):
             if outcome.fault:
                 raise InputError(
                     f"Matching stopped: {outcome.fault.rstrip('.')}. What is matched stays in "

@@ -36,9 +36,9 @@ class PartnerRules:
     def check(self) -> None:
         """Raise InputError where a value cannot be meant."""
         if not 0 <= self.other_cameras <= 1:
-            raise InputError(f"--other-cameras is {self.other_cameras}; it is a share, 0 to 1.")
+            raise InputError(f"`other_cameras` is {self.other_cameras}; it is a share, 0 to 1.")
         if self.sequential < 0:
-            raise InputError(f"--sequential is {self.sequential}; it must be at least 0.")
+            raise InputError(f"`sequential` is {self.sequential}; it must be at least 0.")
 
 
 def without_same_frame(ranking: Ranking, frames: Sequence[int | None]) -> Ranking:

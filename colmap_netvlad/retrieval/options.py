@@ -33,7 +33,7 @@ def check_k(k: int, num_images: int) -> int:
         InputError: `k` is not positive, or there are fewer than two images.
     """
     if k < 1:
-        raise InputError(f"--k is {k}; it is the number of partners of each image, at least 1.")
+        raise InputError(f"`k` is {k}; it is the number of partners of each image, at least 1.")
     if num_images < 2:
         raise InputError(
             f"The database has {num_images} image{'s' if num_images != 1 else ''}; "

@@ -44,7 +44,7 @@ def rank(
             is not there.
     """
     if options.rerank < 0:
-        raise InputError(f"--rerank is {options.rerank}; it is a number of candidates, 0 for none.")
+        raise InputError(f"`rerank` is {options.rerank}; it is a number of candidates, 0 for none.")
     method = _method(name, options)
     others = len(flight.images) - 1
     k = check_k(options.k, len(flight.images))
@@ -57,7 +57,7 @@ def rank(
         model = deep.cells_key(options.model or method.model, options)
         compared = min(options.rerank, others)
         ranking = rerank(ranking, flight.store, model, k, compared)
-        note = f"{compared} candidates of each image compared place by place (--rerank)"
+        note = f"{compared} candidates of each image compared place by place"
         ranking = replace(ranking, notes=(*ranking.notes, note))
     if k < options.k:
         note = f"k lowered from {options.k} to {k}: the project has {others + 1} images"
@@ -92,7 +92,7 @@ def _positions(flight: Flight, method: Method, options: RetrievalOptions) -> Pos
     """
     mode = options.gps or ("auto" if method.gps else "off")
     if mode not in GPS_MODES:
-        raise InputError(f"There is no --gps {mode}; choose {', '.join(GPS_MODES)}.")
+        raise InputError(f"`gps` is {mode}; choose {', '.join(GPS_MODES)}.")
     if mode == "off" or "positions" in method.needs:
         return None
     positions = flight.positions
@@ -100,6 +100,6 @@ def _positions(flight: Flight, method: Method, options: RetrievalOptions) -> Pos
         why = f" {positions.notes[-1]}" if positions.notes else ""
         raise InputError(
             f"Positions are required, but neither {flight.project.database} nor the photos' EXIF "
-            f"have any that tell photos apart.{why} Use --gps auto or off."
+            f"have any that tell photos apart.{why} Use `gps` auto or off."
         )
     return positions if positions.useful or positions.notes else None

@@ -94,7 +94,7 @@ METHODS: dict[str, Method] = {
         ),
         Method(
             "exhaustive",
-            "All pairs; --k is ignored. The reference for sets where it can be afforded.",
+            "All pairs; k is ignored. The reference for sets where it can be afforded.",
             frozenset(),
             baselines.exhaustive,
         ),

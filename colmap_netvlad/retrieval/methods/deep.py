@@ -67,7 +67,7 @@ def describe_photos(
     if len(left_out) == len(names):
         raise InputError(
             f"None of the {len(names)} photos in {folder} can be used (first: {names[0]} "
-            f"{left_out[names[0]]}); mend --images."
+            f"{left_out[names[0]]}); mend `images`."
         )
     return key, left_out, cache_note(len(to_do) - len(bad), len(names) - len(left_out))
 
