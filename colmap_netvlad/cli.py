@@ -1,135 +1,65 @@
 """The command line: parse, call one public function, print.
 
 Every command is a thin function that imports what it needs inside its body, so that `--help`
-stays fast and one broken dependency does not take the other commands down.
+stays fast and one broken dependency does not take the other commands down. Options that several
+commands share stand in `cli_options`.
 """
 
 from __future__ import annotations
 
+import json
 import shlex
 import sys
-from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from colmap_netvlad import __version__
+from colmap_netvlad.cli_options import (
+    FILE,
+    FOLDER,
+    PATH,
+    copy_option,
+    database_option,
+    device_option,
+    feature_options,
+    given,
+    json_option,
+    k_option,
+    mapping_options,
+    masks_option,
+    matching_options,
+    output_option,
+    project_options,
+    refuse,
+    retrieval_options,
+    seed_option,
+    verbose_option,
+)
 from colmap_netvlad.cli_settings import SettingsCommand
+from colmap_netvlad.retrieval.options import RetrievalOptions
 from colmap_netvlad.runtime.errors import EXIT_PARTIAL
-from colmap_netvlad.terminal import VERBOSE, Group, say
+from colmap_netvlad.runtime.plain import plain
+from colmap_netvlad.terminal import Group, say
 
 if TYPE_CHECKING:
-    from colmap_netvlad.matching.run import MatchReport
+    from colmap_netvlad.colmap.features import FeatureOptions
+    from colmap_netvlad.commands.match import RoundsOptions
+    from colmap_netvlad.mapping.options import MappingOptions
+    from colmap_netvlad.matching.run import MatchOptions
     from colmap_netvlad.project import Project
 
-Command = TypeVar("Command", bound=Callable[..., Any])
 
-FILE = click.Path(path_type=Path, dir_okay=False)
-FOLDER = click.Path(path_type=Path, file_okay=False)
-
-# Options that several commands share, each worded once.
-
-database_option = click.option(
-    "--db",
-    "--database_path",
-    "database",
-    type=click.Path(path_type=Path),
-    help="COLMAP database.  [default: project.db or database.db in the current folder]",
-)
-images_option = click.option(
-    "--images",
-    "--image_path",
-    "images",
-    type=click.Path(path_type=Path),
-    help="Folder that image names are relative to."
-    "  [default: the folder used last, else images/ beside the database]",
-)
-k_option = click.option(
-    "--k", default=30, show_default=True, help="Partners retrieved for each image."
-)
-model_option = click.option(
-    "--model",
-    type=FILE,
-    help="Checkpoint (.safetensors) of the descriptor model, instead of a named --method.",
-)
-device_option = click.option(
-    "--device", help="Where networks run: cpu, cuda, cuda:1, mps.  [default: the fastest there is]"
-)
-cache_option = click.option(
-    "--cache",
-    type=click.Path(path_type=Path),
-    help="Our own file of descriptors and rankings.  [default: project.netvlad.db beside the"
-    " database]",
-)
-seed_option = click.option(
-    "--seed", default=0, show_default=True, help="Seed of every random choice."
-)
-method_option = click.option(
-    "--method",
-    default="hybrid",
-    show_default=True,
-    help="Retrieval method of --rounds; `colmap-netvlad methods` lists them.",
-)
-pairs_option = click.option(
-    "--pairs",
-    type=click.Path(path_type=Path),
-    help="Pairs list (COLMAP's, .csv or .json).  [default: pairs.txt beside the database]",
-)
-gps_option = click.option(
-    "--gps",
-    type=click.Choice(["auto", "off", "require"]),
-    help="Whether positions (priors or EXIF) re-weight the candidates.  [default: auto for hybrid,"
-    " off for the methods of the literature]",
-)
-rerank_option = click.option(
-    "--rerank",
-    type=click.IntRange(min=0),
-    default=100,
-    show_default=True,
-    help="Candidates of each image that deep methods compare place by place; 0: none, the global"
-    " descriptors alone as in the paper.",
-)
-copy_option = click.option(
-    "--copy",
-    is_flag=True,
-    help="Leave the database as it is and write matches into <name>.copy.db beside it.",
-)
-
-
-def rounds_options(command: Command) -> Command:
-    """Add the options of matching in rounds."""
-    for option in (
-        click.option(
-            "--budget",
-            type=int,
-            help="Most pairs that --rounds matches.  [default: k times the number of images]",
-        ),
-        click.option(
-            "--rounds",
-            type=int,
-            help="Match in this many rounds, each choosing its pairs by what the earlier ones"
-            " taught, instead of a pairs list.",
-        ),
-    ):
-        command = option(command)
-    return command
-
-
-def verbose_option(command: Command) -> Command:
-    """Add -v, which lets pycolmap's own log through."""
-
-    def set_verbosity(context: click.Context, parameter: click.Parameter, verbose: bool) -> None:
-        context.meta[VERBOSE] = verbose
-
-    return click.option(
-        "-v",
-        "--verbose",
-        is_flag=True,
-        expose_value=False,
-        callback=set_verbosity,
-        help="Show COLMAP's own log on standard error.",
-    )(command)
+def numbers(context: click.Context, parameter: click.Parameter, text: str) -> tuple[int, ...]:
+    """Read `10,20,30`."""
+    try:
+        return tuple(int(part) for part in text.split(",") if part.strip())
+    except ValueError:
+        raise click.ClickException(
+            f"--k is {text!r}; it is a whole number or several with commas, as in --k 10,20,30."
+        ) from None
 
 
 @click.group(
@@ -154,7 +84,7 @@ def cli() -> None:
     "--images",
     "--image_path",
     "images",
-    type=click.Path(path_type=Path),
+    type=PATH,
     required=True,
     help="Folder of photos; subfolders are searched, names are relative to it.",
 )
@@ -162,317 +92,41 @@ def cli() -> None:
     "--db",
     "--database_path",
     "database",
-    type=click.Path(path_type=Path),
+    type=PATH,
     default=Path("project.db"),
     show_default=True,
     help="COLMAP database to write; made where it is not there.",
 )
-@click.option(
-    "--camera",
-    default="auto",
-    show_default=True,
-    help="Which photos share a camera: auto (equal make, model, focal length and size; without"
-    " EXIF equal folder and size), single, per-folder, per-image.",
-)
-@click.option(
-    "--camera-model",
-    default="SIMPLE_RADIAL",
-    show_default=True,
-    help="COLMAP's model of new cameras, SIMPLE_RADIAL or OPENCV for example.",
-)
-@click.option(
-    "--max-image-size",
-    type=int,
-    help="Longer side at which SIFT runs, px.  [default: COLMAP's, 3200]",
-)
-@click.option("--max-features", default=8192, show_default=True, help="Most features of a photo.")
-@click.option(
-    "--masks",
-    type=click.Path(path_type=Path),
-    help="Folder of masks in COLMAP's way (<photo>.png, black is ignored).",
-)
-@click.option(
-    "--threads", type=int, help="Photos at once.  [default: as processors and memory allow]"
-)
+@feature_options
+@masks_option
 @verbose_option
-def features(images: Path, database: Path, **options: Any) -> None:
+def features(images: Path, database: Path, features: FeatureOptions, masks: Path | None) -> None:
     """Import photos into a COLMAP database and extract SIFT features.
 
     This writes the database; one of COLMAP 3.x is brought to the schema of COLMAP 4. Photos that
     have features are passed over, so a stopped run goes on where it stopped. Photos that are
     truncated, empty or no photos are listed at the end and left out (exit code 3).
     """
-    from colmap_netvlad.cache.store import Store
-    from colmap_netvlad.colmap.features import FeatureOptions, extract_features
-    from colmap_netvlad.project import Project
+    from colmap_netvlad.commands.features import import_photos, report_lines
 
-    report = extract_features(images, database, FeatureOptions(**options))
-    with Store(Project(database, images).cache) as store:
-        store.remember_images(images)
-    click.echo(
-        f"Photos: {report.photos:,}, {report.already:,} with features before, "
-        f"{report.extracted:,} extracted now ({report.features:,} features), "
-        f"{report.cameras:,} camera{'s' if report.cameras != 1 else ''} in {database}."
-    )
+    report = import_photos(images, database, replace(features, masks=masks))
+    say(*report_lines(report, database))
     click.echo(f"Next: colmap-netvlad pairs --db {quoted(database)}")
     finish_partial([f"Left out: {name} {reason}" for name, reason in report.bad])
 
 
 @cli.command()
-@database_option
-@images_option
-@pairs_option
-@click.option(
-    "--output",
-    "--output_path",
-    "output",
-    type=click.Path(path_type=Path),
-    help="Folder of the models.  [default: sparse beside the database; sparse-2, sparse-3, ..."
-    " where there are models already]",
-)
-@click.option(
-    "--mapper",
-    default="auto",
-    show_default=True,
-    help="How the model is built: incremental (COLMAP's), parallel (in clusters, for large"
-    " flights), hierarchical or global (COLMAP's); auto: incremental for small flights, parallel"
-    " for large ones.",
-)
-@click.option(
-    "--cluster-size",
-    type=click.IntRange(min=3),
-    help="Images of a cluster of parallel and hierarchical mapping.  [default: 250]",
-)
-@click.option(
-    "--threads", type=click.IntRange(min=1), help="Processors for mapping.  [default: all]"
-)
-@click.option(
-    "--memory",
-    type=click.FloatRange(min=0, min_open=True),
-    help="GiB that the workers of parallel mapping may take.  [default: 70 % of the machine's]",
-)
-@copy_option
-@rounds_options
-@k_option
-@method_option
-@device_option
-@seed_option
-@verbose_option
-def reconstruct(
-    database: Path | None,
-    images: Path | None,
-    pairs: Path | None,
-    output: Path | None,
-    mapper: str,
-    cluster_size: int | None,
-    threads: int | None,
-    memory: float | None,
-    copy: bool,
-    rounds: int | None,
-    budget: int | None,
-    k: int,
-    method: str,
-    device: str | None,
-    seed: int,
-) -> None:
-    """Match the pairs, verify them, and build the sparse model.
-
-    This writes matches into the database, where COLMAP keeps them (--copy does not); one of
-    COLMAP 3.x is brought to the schema of COLMAP 4. Pairs matched before are not matched again,
-    so a stopped run goes on where it stopped.
-    """
-    from rich.console import Console
-
-    from colmap_netvlad.commands.reconstruct import (
-        ReconstructOptions,
-        check_mapper,
-        map_and_report,
-        report_lines,
-        working_copy,
-    )
-    from colmap_netvlad.commands.reconstruct import reconstruct as run
-    from colmap_netvlad.mapping.options import MappingOptions
-    from colmap_netvlad.matching.run import MatchOptions
-    from colmap_netvlad.project import find_project
-    from colmap_netvlad.terminal import models_table
-
-    check_mapper(mapper)
-    project = find_project(database, images)
-    pairs = pairs or project.pairs
-    output = output or project.sparse
-    if copy:
-        project = working_copy(project)
-    mapping = MappingOptions(
-        seed=seed,
-        threads=threads,
-        cluster_size=cluster_size,
-        memory=None if memory is None else memory * 2**30,
-    )
-    options = ReconstructOptions(mapper, mapping, MatchOptions(seed=seed))
-    if rounds is None:
-        report = run(project, pairs, output, options)
-    else:
-        matches = match_and_print_rounds(project, rounds, budget, k, method, device, seed)
-        report = map_and_report(project, matches, output, options)
-    Console().print(models_table(report))
-    say(*report_lines(report))
-    click.echo(f"Matches are in {project.database}, models in {report.output}.")
-
-
-@cli.command()
-@database_option
-@images_option
-@pairs_option
-@copy_option
-@rounds_options
-@k_option
-@method_option
-@device_option
-@seed_option
-@verbose_option
-def match(
-    database: Path | None,
-    images: Path | None,
-    pairs: Path | None,
-    copy: bool,
-    rounds: int | None,
-    budget: int | None,
-    k: int,
-    method: str,
-    device: str | None,
-    seed: int,
-) -> None:
-    """Match and verify the pairs of a list, or spend a budget of pairs in --rounds.
-
-    This writes matches into the database, where COLMAP keeps them (--copy does not); one of
-    COLMAP 3.x is brought to the schema of COLMAP 4. A stopped run goes on where it stopped.
-    """
-    from colmap_netvlad.colmap.database import image_names
-    from colmap_netvlad.commands.reconstruct import view_graph_lines, working_copy
-    from colmap_netvlad.graph.verified import verified_components
-    from colmap_netvlad.matching.run import MatchOptions, match_pairs
-    from colmap_netvlad.pairs.lists import read_pairs
-    from colmap_netvlad.project import find_project
-
-    project = find_project(database, images)
-    listed = pairs or project.pairs
-    if copy:
-        project = working_copy(project)
-    if rounds is None:
-        chosen = read_pairs(listed, image_names(project.database))
-        report = match_pairs(project.database, chosen, MatchOptions(seed=seed))
-    else:
-        report = match_and_print_rounds(project, rounds, budget, k, method, device, seed)
-    click.echo(
-        f"Pairs: {report.requested:,} ({report.already:,} matched before), {report.verified:,} "
-        f"verified, {report.seconds / 60:.1f} minutes. Matches are in {project.database}."
-    )
-    say(*view_graph_lines(verified_components(project.database)))
-
-
-def match_and_print_rounds(
-    project: Project,
-    rounds: int,
-    budget: int | None,
-    k: int,
-    method: str,
-    device: str | None,
-    seed: int,
-) -> MatchReport:
-    """Match in rounds and print a line for each."""
-    from colmap_netvlad.matching.rounds import rank_and_match_in_rounds, rounds_lines
-    from colmap_netvlad.matching.run import MatchOptions
-    from colmap_netvlad.retrieval.options import RetrievalOptions
-
-    options = RetrievalOptions(k=k, device=device, seed=seed)
-    spent = rank_and_match_in_rounds(
-        project, method, options, rounds, budget, MatchOptions(seed=seed)
-    )
-    say(*rounds_lines(spent))
-    return spent.matches
-
-
-@cli.command()
-@database_option
-@click.option(
-    "--images",
-    "--image_path",
-    "images",
-    type=click.Path(path_type=Path),
-    help="The photo folder, with the new photos copied beside the old ones."
-    "  [default: the folder used last, else images/ beside the database]",
-)
-@click.option(
-    "--sparse",
-    type=click.Path(path_type=Path),
-    help="Folder of the model to extend.  [default: sparse/0, or 0 of the newest sparse-N]",
-)
-@click.option(
-    "--output",
-    "--output_path",
-    "output",
-    type=click.Path(path_type=Path),
-    help="Folder of the extended model.  [default: the next sparse-N beside the database]",
-)
-@click.option("--among-new", is_flag=True, help="Pair the new photos with each other as well.")
-@k_option
-@method_option
-@device_option
-@seed_option
-@verbose_option
-def add(
-    database: Path | None,
-    images: Path | None,
-    sparse: Path | None,
-    output: Path | None,
-    among_new: bool,
-    k: int,
-    method: str,
-    device: str | None,
-    seed: int,
-) -> None:
-    """Register new photos into an existing model.
-
-    This writes the database: features and matches of the new photos. Only what is new is
-    computed: a new photo is paired with its k most likely partners among the old ones. The old
-    model is left as it is, the extended one is written beside it.
-    """
-    from colmap_netvlad.commands.add import AddOptions, add_lines, add_photos, newest_model
-    from colmap_netvlad.project import find_project
-    from colmap_netvlad.retrieval.options import RetrievalOptions
-
-    project = find_project(database, images)
-    options = AddOptions(
-        method, RetrievalOptions(k=k, device=device, seed=seed), among_new=among_new, seed=seed
-    )
-    report = add_photos(project, sparse or newest_model(project), options, output)
-    say(*add_lines(report))
-    finish_partial([f"Left out: {name} {reason}" for name, reason in report.features.bad])
-
-
-def numbers(context: click.Context, parameter: click.Parameter, text: str) -> tuple[int, ...]:
-    """Read `10,20,30`."""
-    try:
-        return tuple(int(part) for part in text.split(",") if part.strip())
-    except ValueError:
-        raise click.ClickException(
-            f"--k is {text!r}; it is a whole number or several with commas, as in --k 10,20,30."
-        ) from None
-
-
-def quoted(path: Path) -> str:
-    """Return a path as the user's shell takes it."""
-    return shlex.quote(str(path))
-
-
-@cli.command()
-@database_option
-@images_option
+@project_options
 @k_option
 @click.option(
     "--method", default=None, help="Retrieval method; `colmap-netvlad methods` lists them."
 )
-@model_option
+@click.option(
+    "--descriptors",
+    type=FILE,
+    help="Rank by global descriptors of others (MegaLoc, SALAD, ...) in hloc's HDF5 layout.",
+)
+@retrieval_options
 @click.option(
     "--format",
     type=click.Choice(["colmap", "csv", "json"]),
@@ -481,18 +135,8 @@ def quoted(path: Path) -> str:
     help="COLMAP's pairs list, or with scores and ranks.",
 )
 @click.option(
-    "--output",
-    type=click.Path(path_type=Path),
-    help="The pairs list.  [default: pairs.txt beside the database]",
+    "--output", type=PATH, help="The pairs list.  [default: pairs.txt beside the database]"
 )
-@click.option(
-    "--exact/--hnsw",
-    default=None,
-    help="Force exact or approximate (HNSW) search.  [default: by the number of images]",
-)
-@click.option("--vocab-tree", type=FILE, help="Vocabulary tree of the method bow.")
-@gps_option
-@rerank_option
 @click.option(
     "--other-cameras",
     type=float,
@@ -507,11 +151,6 @@ def quoted(path: Path) -> str:
     show_default=True,
     help="Pair each photo with this many that follow it by name too (video, flight lines).",
 )
-@click.option(
-    "--masks",
-    type=FOLDER,
-    help="Folder of masks in COLMAP's way (<photo>.png): black areas are neutral to networks.",
-)
 @click.option("--join", "own_pairs", type=FILE, help="A pairs list of your own to join in.")
 @click.option(
     "--connect/--no-connect",
@@ -520,58 +159,186 @@ def quoted(path: Path) -> str:
     help="Where each image's k nearest leave the images in several components, add the best few"
     " pairs between these (5 % at most).",
 )
-@cache_option
-@device_option
-@seed_option
+@click.option(
+    "--export", type=PATH, help="Also write our global descriptors there, in hloc's HDF5 layout."
+)
+@json_option
 @verbose_option
 def pairs(
-    database: Path | None,
-    images: Path | None,
+    project: Project,
     k: int,
     method: str | None,
-    model: Path | None,
+    descriptors: Path | None,
+    retrieval: RetrievalOptions,
     format: str,
     output: Path | None,
-    exact: bool | None,
-    vocab_tree: Path | None,
-    gps: str | None,
-    rerank: int,
     other_cameras: float,
     sequential: int,
     own_pairs: Path | None,
-    masks: Path | None,
     connect: bool,
-    cache: Path | None,
-    device: str | None,
-    seed: int,
+    export: Path | None,
+    as_json: bool,
 ) -> None:
     """Retrieve the k nearest partners of each image and write the pairs list.
 
     Never writes to the database. Descriptors are kept in project.netvlad.db beside it: a second
     run computes none, ten new photos cost ten.
     """
+    from colmap_netvlad.commands.pairs import as_json as as_dictionary
     from colmap_netvlad.commands.pairs import make_pairs, summary
     from colmap_netvlad.models.catalogue import DEFAULT
     from colmap_netvlad.pairs.rules import PartnerRules
-    from colmap_netvlad.project import find_project
-    from colmap_netvlad.retrieval.options import RetrievalOptions
 
-    project = find_project(database, images, cache)
-    options = RetrievalOptions(
-        k=k,
-        model=model,
-        device=device,
-        seed=seed,
-        vocab_tree=vocab_tree,
-        exact=exact,
-        masks=masks,
-        gps=gps,
-        rerank=rerank,
+    if descriptors is not None:
+        refuse(given("method"), "would be ignored: --descriptors rank; leave one out.")
+    report = make_pairs(
+        project,
+        str(descriptors or method or DEFAULT),
+        replace(retrieval, k=k),
+        format,
+        output,
+        PartnerRules(other_cameras, sequential, own_pairs),
+        connect,
+        export,
     )
-    rules = PartnerRules(other_cameras, sequential, own_pairs)
-    report = make_pairs(project, method or DEFAULT, options, format, output, rules, connect)
-    say(*summary(project, report))
+    if as_json:
+        print_json(as_dictionary(report))
+    else:
+        say(*summary(project, report))
     finish_partial([f"Left out: {name} {reason}" for name, reason in report.ranking.left_out])
+
+
+@cli.command()
+@project_options
+@copy_option
+@matching_options
+@json_option
+@verbose_option
+def match(
+    project: Project,
+    copy: bool,
+    pairs: Path | None,
+    rounds: RoundsOptions | None,
+    matching: MatchOptions,
+    as_json: bool,
+) -> None:
+    """Match and verify the pairs of a list, or spend a budget of pairs in --rounds.
+
+    This writes matches into the database, where COLMAP keeps them (--copy does not); one of
+    COLMAP 3.x is brought to the schema of COLMAP 4. A stopped run goes on where it stopped.
+    """
+    from colmap_netvlad.commands.match import as_json as as_dictionary
+    from colmap_netvlad.commands.match import match as run
+    from colmap_netvlad.commands.match import report_lines, working_copy
+
+    if copy:
+        project = working_copy(project)
+    report = run(project, pairs, rounds, matching)
+    if as_json:
+        print_json({**as_dictionary(report), "database": project.database})
+        return
+    say(*report_lines(report))
+    click.echo(f"Matches are in {project.database}.")
+
+
+@cli.command()
+@project_options
+@output_option(
+    help="Folder of the models.  [default: sparse beside the database; sparse-2, sparse-3, ..."
+    " where there are models already]",
+)
+@mapping_options
+@copy_option
+@matching_options
+@json_option
+@verbose_option
+def reconstruct(
+    project: Project,
+    output: Path | None,
+    mapper: str,
+    mapping: MappingOptions,
+    copy: bool,
+    pairs: Path | None,
+    rounds: RoundsOptions | None,
+    matching: MatchOptions,
+    as_json: bool,
+) -> None:
+    """Match the pairs, verify them, and build the sparse model.
+
+    This writes matches into the database, where COLMAP keeps them (--copy does not); one of
+    COLMAP 3.x is brought to the schema of COLMAP 4. Pairs matched before are not matched again,
+    so a stopped run goes on where it stopped.
+    """
+    from colmap_netvlad.commands.match import working_copy
+    from colmap_netvlad.commands.reconstruct import ReconstructOptions, check_mapper, report_lines
+    from colmap_netvlad.commands.reconstruct import as_json as as_dictionary
+    from colmap_netvlad.commands.reconstruct import reconstruct as run
+    from colmap_netvlad.terminal import print_models
+
+    check_mapper(mapper)
+    if copy:
+        project = working_copy(project)
+    options = ReconstructOptions(mapper, replace(mapping, seed=matching.seed), matching)
+    report = run(project, pairs, output, options, rounds)
+    if as_json:
+        print_json({**as_dictionary(report), "database": project.database})
+        return
+    print_models(report)
+    say(*report_lines(report))
+    click.echo(f"Matches are in {project.database}, models in {report.output}.")
+
+
+@cli.command()
+@project_options
+@click.option(
+    "--sparse",
+    type=PATH,
+    help="Folder of the model to extend.  [default: the largest in sparse, or in the newest"
+    " sparse-N]",
+)
+@output_option(
+    help="Folder of the extended model.  [default: the next sparse-N beside the database]"
+)
+@click.option("--among-new", is_flag=True, help="Pair the new photos with each other as well.")
+@k_option
+@click.option(
+    "--method",
+    default="hybrid",
+    show_default=True,
+    help="Retrieval method; `colmap-netvlad methods` lists them.",
+)
+@retrieval_options
+@feature_options
+@verbose_option
+def add(
+    project: Project,
+    sparse: Path | None,
+    output: Path | None,
+    among_new: bool,
+    k: int,
+    method: str,
+    retrieval: RetrievalOptions,
+    features: FeatureOptions,
+) -> None:
+    """Register new photos into an existing model.
+
+    Copy them beside the old ones first. This writes the database: features and matches of the new
+    photos. Only what is new is computed: a new photo is paired with its k most likely partners
+    among the old ones. The old model is left as it is, the extended one is written beside it. Give
+    the SIFT settings that the old photos were imported with.
+    """
+    from colmap_netvlad.commands.add import AddOptions, add_lines, add_photos
+
+    options = AddOptions(
+        method,
+        replace(retrieval, k=k),
+        among_new,
+        replace(features, masks=retrieval.masks),
+        retrieval.seed,
+    )
+    report = add_photos(project, sparse, options, output)
+    say(*add_lines(report))
+    finish_partial([f"Left out: {name} {reason}" for name, reason in report.features.bad])
 
 
 @cli.command()
@@ -579,7 +346,8 @@ def pairs(
 @click.option(
     "--graphml", type=FILE, help="Also write the graph for Gephi, yEd or Cytoscape (GraphML)."
 )
-def viewgraph(database: Path | None, graphml: Path | None) -> None:
+@json_option
+def viewgraph(database: Path | None, graphml: Path | None, as_json: bool) -> None:
     """Show how well the verified pairs hold the flight together.
 
     Components, images per pair, and the images and pairs whose loss splits the model. The
@@ -591,14 +359,23 @@ def viewgraph(database: Path | None, graphml: Path | None) -> None:
     graph = read_view_graph(locate_database(database))
     if graphml is not None:
         graph.write_graphml(graphml)
-    click.echo("\n".join(statistics_lines(graph.statistics())))
+    statistics = graph.statistics()
+    if as_json:
+        print_json(statistics)
+    else:
+        say(*statistics_lines(statistics))
 
 
 @cli.command()
-def methods() -> None:
+@json_option
+def methods(as_json: bool) -> None:
     """List the retrieval methods and their sources."""
     from colmap_netvlad.retrieval.methods import METHODS
 
+    if as_json:
+        rows = [{"name": m.name, "summary": m.summary, "needs": m.needs} for m in METHODS.values()]
+        print_json(rows)
+        return
     width = max(map(len, METHODS))
     for method in METHODS.values():
         click.echo(f"{method.name:{width}}  {method.summary}")
@@ -621,20 +398,16 @@ def demo(output: Path, method: str | None, seed: int) -> None:
     Takes about two minutes. Exit code 1 where a photo is not registered, or a camera centre is
     off by more than 1 % of the flight's extent.
     """
-    from dataclasses import replace
-
-    from rich.console import Console
-
     from colmap_netvlad.commands.demo import DEMO_FLIGHT, run_demo
     from colmap_netvlad.commands.reconstruct import ReconstructReport
     from colmap_netvlad.models.catalogue import DEFAULT
-    from colmap_netvlad.terminal import models_table
+    from colmap_netvlad.terminal import print_models
 
     def tell(item: str | ReconstructReport) -> None:
         if isinstance(item, str):
             say(item)
         else:
-            Console().print(models_table(item))
+            print_models(item)
 
     flight = replace(DEMO_FLIGHT, seed=seed)
     if not run_demo(output, method or DEFAULT, flight, tell).passed:
@@ -642,13 +415,13 @@ def demo(output: Path, method: str | None, seed: int) -> None:
 
 
 @cli.command()
-@database_option
-@images_option
+@project_options
 @click.option(
     "--methods",
-    default="bow,vlad",
+    default="bow,vlad,netvlad-o-lite",
     show_default=True,
-    help="Methods, and checkpoints by path, with commas; `colmap-netvlad methods` lists them.",
+    help="Methods, checkpoints and files of descriptors by path, with commas; `colmap-netvlad"
+    " methods` lists them.",
 )
 @click.option(
     "--k",
@@ -657,9 +430,8 @@ def demo(output: Path, method: str | None, seed: int) -> None:
     show_default=True,
     help="Partners retrieved for each image, one number or several: 10,20,30.",
 )
-@click.option(
-    "--output",
-    type=click.Path(path_type=Path),
+@retrieval_options
+@output_option(
     help="Folder of the comparison.  [default: <database>-compare beside the database]",
 )
 @click.option(
@@ -670,29 +442,19 @@ def demo(output: Path, method: str | None, seed: int) -> None:
 @click.option(
     "--reconstruct-k", type=int, help="Which of --k the models are made from.  [default: largest]"
 )
-@click.option("--vocab-tree", type=FILE, help="Vocabulary tree of the method bow.")
-@rerank_option
 @click.option(
     "--yes", "confirm", is_flag=True, help="Do not ask before a long exhaustive matching."
 )
-@cache_option
-@device_option
-@seed_option
 @verbose_option
 def compare(
-    database: Path | None,
-    images: Path | None,
+    project: Project,
     methods: str,
     k: tuple[int, ...],
+    retrieval: RetrievalOptions,
     output: Path | None,
     reconstruct: bool,
     reconstruct_k: int | None,
-    vocab_tree: Path | None,
-    rerank: int,
     confirm: bool,
-    cache: Path | None,
-    device: str | None,
-    seed: int,
 ) -> None:
     """Compare retrieval methods on your own flight, and write a report page.
 
@@ -703,8 +465,6 @@ def compare(
     """
     from colmap_netvlad.commands.compare import CompareOptions
     from colmap_netvlad.commands.compare import compare as run
-    from colmap_netvlad.project import find_project
-    from colmap_netvlad.retrieval.options import RetrievalOptions
     from colmap_netvlad.terminal import print_comparison
 
     def ask(question: str) -> bool:
@@ -715,18 +475,18 @@ def compare(
         output=output,
         reconstruct=reconstruct,
         reconstruct_k=reconstruct_k,
-        retrieval=RetrievalOptions(device=device, vocab_tree=vocab_tree, rerank=rerank),
-        seed=seed,
+        retrieval=retrieval,
+        seed=retrieval.seed,
     )
     names = [name.strip() for name in methods.split(",") if name.strip()]
-    comparison, workspace = run(find_project(database, images, cache), names, options, ask)
-    print_comparison(comparison)
-    click.echo(f"Report: {workspace.html} (figures: {workspace.json.name}, {workspace.csv.name})")
-    finish_partial([f"Not finished: {sentence}" for sentence in comparison.incomplete])
+    report = run(project, names, options, ask)
+    print_comparison(report.comparison)
+    click.echo(f"Report: {report.page} (figures: {report.json.name}, {report.csv.name})")
+    finish_partial([f"Not finished: {sentence}" for sentence in report.comparison.incomplete])
 
 
 @cli.command()
-@click.argument("datasets", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.argument("datasets", nargs=-1, required=True, type=PATH)
 @click.option(
     "--output",
     type=FOLDER,
@@ -743,13 +503,13 @@ def compare(
     "--method", default="bow", show_default=True, help="Retrieval method that chooses the pairs."
 )
 @k_option
+@retrieval_options
 @click.option(
     "--mapper",
     default="incremental",
     show_default=True,
     help="Mapping method; none: tracks of verified matches stand for 3D points (fast, no poses).",
 )
-@seed_option
 @verbose_option
 def annotate(
     datasets: tuple[Path, ...],
@@ -757,8 +517,8 @@ def annotate(
     databases: Path | None,
     method: str,
     k: int,
+    retrieval: RetrievalOptions,
     mapper: str,
-    seed: int,
 ) -> None:
     """Annotate scenes for training: which photos see the same 3D points.
 
@@ -768,21 +528,21 @@ def annotate(
     """
     from colmap_netvlad.commands import annotate as annotation
 
-    options = annotation.AnnotateOptions(method, k, output, databases, mapper, seed)
+    options = annotation.AnnotateOptions(method, replace(retrieval, k=k), output, databases, mapper)
     report = annotation.annotate(datasets, options)
     say(*annotation.table_lines(report.scenes))
     finish_partial(report.left_out)
 
 
 @cli.command(cls=SettingsCommand)
-@click.argument("datasets", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.argument("datasets", nargs=-1, required=True, type=PATH)
 @click.option(
     "--output", type=FOLDER, required=True, help="Folder of the run; an unfinished one goes on."
 )
 @click.option(
     "--validation",
     multiple=True,
-    type=click.Path(path_type=Path),
+    type=PATH,
     help="Annotated scenes never trained on, by which the best epoch is chosen.",
 )
 @click.option("--leave-out", multiple=True, help="Name of a scene in DATASETS not to train on.")
@@ -817,6 +577,16 @@ def train(
     report = run(scenes, measured, options, output, device=device, name=name)
     say(*report_lines(report))
     finish_partial(report.left_out)
+
+
+def quoted(path: Path) -> str:
+    """Return a path as the user's shell takes it."""
+    return shlex.quote(str(path))
+
+
+def print_json(report: Any) -> None:
+    """Print a report as JSON on standard output."""
+    click.echo(json.dumps(plain(report), indent=1, ensure_ascii=False))
 
 
 def finish_partial(left_out: list[str]) -> None:

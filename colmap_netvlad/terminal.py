@@ -184,6 +184,13 @@ def _new_bars() -> Progress:
     )
 
 
+def print_models(report: ReconstructReport) -> None:
+    """Print the figures of all models on standard output."""
+    from rich.console import Console
+
+    Console().print(models_table(report))
+
+
 def models_table(report: ReconstructReport) -> Table:
     """Return the figures of every component, and in total where there are several."""
     from rich.table import Table

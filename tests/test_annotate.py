@@ -22,6 +22,7 @@ from colmap_netvlad.commands import annotate as module
 from colmap_netvlad.commands.annotate import AnnotateOptions, annotate, find_scenes, table_lines
 from colmap_netvlad.demo.render import RenderedFlight
 from colmap_netvlad.project import Project
+from colmap_netvlad.retrieval.options import RetrievalOptions
 from colmap_netvlad.runtime.errors import EXIT_PARTIAL, InputError
 from colmap_netvlad.training.scenes import (
     ANNOTATION,
@@ -157,7 +158,9 @@ def test_an_annotation_reads_back_as_it_was_written(annotated: Path, tmp_path: P
 
 
 def test_bow_pairs_annotate_a_scene_from_its_photos_alone(dataset: Path, tmp_path: Path) -> None:
-    report = annotate([dataset / "village"], AnnotateOptions(output=tmp_path, k=5))
+    report = annotate(
+        [dataset / "village"], AnnotateOptions(output=tmp_path, retrieval=RetrievalOptions(k=5))
+    )
     assert not report.left_out
     (scene,) = report.scenes
     assert scene.method == "bow" and scene.registered >= 10
@@ -213,7 +216,9 @@ def test_a_killed_run_goes_on_with_the_pairs_already_matched(
         return reports[-1]
 
     monkeypatch.setattr(matching, "match_pairs", counted)
-    report = annotate([dataset], AnnotateOptions(output=tmp_path / "out", k=4))
+    report = annotate(
+        [dataset], AnnotateOptions(output=tmp_path / "out", retrieval=RetrievalOptions(k=4))
+    )
     assert not report.left_out and report.scenes[0].registered >= 10
     assert reports[0].matched == 0 and reports[0].already > 0
 

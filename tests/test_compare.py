@@ -15,15 +15,22 @@ from click.testing import CliRunner
 
 from colmap_netvlad.cli import cli
 from colmap_netvlad.commands import compare as pipeline
-from colmap_netvlad.commands.compare import CompareOptions, compare
+from colmap_netvlad.commands.compare import CompareOptions
 from colmap_netvlad.compare import models, pool
 from colmap_netvlad.compare.result import Comparison, read_json, write_json
-from colmap_netvlad.compare.workspace import file_name, open_workspace
+from colmap_netvlad.compare.workspace import Workspace, file_name, open_workspace
 from colmap_netvlad.flight import open_flight
 from colmap_netvlad.graph.verified import correct_pairs, verified_by_name
 from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.project import Project
 from colmap_netvlad.runtime.errors import EXIT_PARTIAL, InputError
+
+
+def compare(*arguments, **options) -> tuple[Comparison, Workspace]:
+    """Compare, and return the figures and the comparison's folder."""
+    report = pipeline.compare(*arguments, **options)
+    return report.comparison, Workspace(report.page.parent)
+
 
 METHODS = ("vlad", "random")
 # One thread: COLMAP adds in the order its threads finish, so only that repeats the last digits.

@@ -16,7 +16,7 @@ from colmap_netvlad.colmap import engine
 from colmap_netvlad.colmap import features as features_module
 from colmap_netvlad.colmap.database import ImageRow, open_database
 from colmap_netvlad.colmap.features import FeatureOptions, FeatureReport, extract_features
-from colmap_netvlad.project import find_project
+from colmap_netvlad.project import open_project
 from colmap_netvlad.runtime.errors import EXIT_PARTIAL, InputError
 
 FEW = {"max_features": 200, "threads": 1}
@@ -56,7 +56,7 @@ def test_sound_photos_of_every_kind_are_imported_and_broken_ones_listed(tmp_path
         assert f"Left out: {name} " in result.stderr
     assert f"{len(SOUND)} extracted now" in result.stdout
     assert "colmap-netvlad pairs --db" in result.stdout
-    assert find_project(tmp_path / "project.db").images == images
+    assert open_project(tmp_path / "project.db").images == images
 
 
 def test_a_second_run_extracts_nothing_and_new_photos_share_the_camera(images: Path) -> None:

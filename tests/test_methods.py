@@ -26,7 +26,7 @@ from colmap_netvlad.runtime.errors import InputError
 def rank(
     project: Project,
     name: str | Path,
-    options: RetrievalOptions = RetrievalOptions(),  # noqa: B008
+    options: RetrievalOptions = RetrievalOptions(),
 ) -> Ranking:
     """Rank, cut to the k asked for."""
     return rank_project(project, name, options).top(options.k)

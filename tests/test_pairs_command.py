@@ -27,7 +27,7 @@ from colmap_netvlad.cli import cli
 from colmap_netvlad.colmap.database import image_names
 from colmap_netvlad.commands.pairs import make_pairs
 from colmap_netvlad.pairs.union import union_of_top
-from colmap_netvlad.project import Project, find_project
+from colmap_netvlad.project import Project, open_project
 from colmap_netvlad.retrieval.options import RetrievalOptions
 from colmap_netvlad.retrieval.rank import rank_project
 from colmap_netvlad.runtime.errors import EXIT_PARTIAL
@@ -150,7 +150,7 @@ def test_a_workspace_moved_as_a_whole_still_finds_its_photos(
     project.images.rename(inside)
     assert run("--db", project.database, "--images", inside, "--method", "random").exit_code == 0
     project.folder.rename(tmp_path / "moved")
-    found = find_project(tmp_path / "moved" / "project.db")
+    found = open_project(tmp_path / "moved" / "project.db")
     assert found.images is not None
     assert found.images.resolve() == (tmp_path / "moved" / "DCIM").resolve()
 

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from colmap_netvlad.cache.store import Store
 from colmap_netvlad.project import open_project
 from colmap_netvlad.runtime.errors import InputError
 
@@ -28,9 +29,11 @@ def test_the_remembered_photo_folder_comes_before_images_beside_the_database(
     (tmp_path / "images").mkdir()
     remembered = tmp_path / "elsewhere"
     remembered.mkdir()
-    assert open_project(tmp_path / "project.db", remembered=remembered).images == remembered
+    with Store(tmp_path / "project.netvlad.db") as store:
+        store.remember_images(remembered)
+    assert open_project(tmp_path / "project.db").images == remembered
     remembered.rmdir()
-    project = open_project(tmp_path / "project.db", remembered=remembered)
+    project = open_project(tmp_path / "project.db")
     assert project.images == tmp_path / "images"
 
 

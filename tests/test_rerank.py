@@ -25,7 +25,7 @@ from colmap_netvlad.retrieval.rerank import CHANCE, Places, agreeing_matches, re
 def rank(
     project: Project,
     name: str | Path,
-    options: RetrievalOptions = RetrievalOptions(),  # noqa: B008
+    options: RetrievalOptions = RetrievalOptions(),
 ) -> Ranking:
     """Rank, cut to the k asked for."""
     return rank_project(project, name, options).top(options.k)

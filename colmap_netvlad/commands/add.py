@@ -11,7 +11,7 @@ import numpy as np
 from colmap_netvlad.cache.ranking import NO_PARTNER, Ranking
 from colmap_netvlad.colmap.database import image_names
 from colmap_netvlad.colmap.features import FeatureOptions, FeatureReport, extract_features
-from colmap_netvlad.mapping.extend import extend_model, read_model
+from colmap_netvlad.mapping.extend import extend_model, largest_model, read_model
 from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.mapping.output import free_output
 from colmap_netvlad.mapping.summary import ModelSummary, registered_names, summarize
@@ -35,7 +35,7 @@ class AddOptions:
         seed: of matching and mapping.
     """
 
-    method: str
+    method: str = "hybrid"
     retrieval: RetrievalOptions = field(default_factory=RetrievalOptions)
     among_new: bool = False
     features: FeatureOptions = field(default_factory=FeatureOptions)
@@ -67,7 +67,10 @@ class AddReport:
 
 
 def add_photos(
-    project: Project, model: Path, options: AddOptions, output: Path | None = None
+    project: Project,
+    model: Path | None = None,
+    options: AddOptions = AddOptions(),
+    output: Path | None = None,
 ) -> AddReport:
     """Import the photos the database does not have, and register them into a model.
 
@@ -77,12 +80,13 @@ def add_photos(
     Args:
         project: its photo folder holds the new photos beside the old ones; its database gets
             their features and matches.
-        model: folder of the existing sparse model.
+        model: folder of the existing sparse model; None: see `newest_model`.
         output: folder of models for the extended one; default `sparse`, `sparse-2`, ...
 
     Raises:
         InputError: no new photos, a folder that lacks the old photos, or no such model.
     """
+    model = model or newest_model(project)
     folder = project.need_images()
     old = image_names(project.database)
     new = _new_photos(folder, old)
@@ -154,19 +158,20 @@ def add_lines(report: AddReport) -> list[str]:
 
 
 def newest_model(project: Project) -> Path:
-    """Return `0` of the highest-numbered `sparse`, `sparse-2`, ... folder of a workspace.
+    """Return the largest model in the highest-numbered `sparse`, `sparse-2`, ... of a workspace.
 
     Raises:
         InputError: there is none.
     """
     folders = [project.sparse, *project.folder.glob(f"{project.sparse.name}-*")]
-    models = [folder / "0" for folder in folders if (folder / "0").is_dir()]
-    if not models:
-        raise InputError(
-            f"There is no model in {project.sparse}; run `colmap-netvlad reconstruct`, or name "
-            "one with `sparse`."
-        )
-    return max(models, key=lambda model: _number(model.parent.name))
+    for folder in sorted(folders, key=lambda folder: _number(folder.name), reverse=True):
+        models = sorted(path for path in folder.glob("*") if path.name.isdigit())
+        if models:
+            return largest_model(models)
+    raise InputError(
+        f"There is no model in {project.sparse}; run `colmap-netvlad reconstruct`, or name one "
+        "with `sparse`."
+    )
 
 
 def _number(name: str) -> int:

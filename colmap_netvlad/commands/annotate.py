@@ -20,6 +20,7 @@ from colmap_netvlad.photos.files import (
     photo_fingerprint,
     read_header,
 )
+from colmap_netvlad.retrieval.options import RetrievalOptions
 from colmap_netvlad.runtime.errors import InputError
 from colmap_netvlad.training.scenes import (
     ANNOTATION,
@@ -59,22 +60,20 @@ class AnnotateOptions:
 
     Attributes:
         method: retrieval method that chooses the pairs to match; the paper's is "bow".
-        k: partners retrieved for each image.
+        retrieval: k and what else the method takes.
         output: where annotations and working files go, one folder a scene; default: beside
             each scene's photos.
         databases: folder of matched COLMAP databases, `<scene>.db`; a scene found there is
             neither extracted nor matched again (its database is copied, never opened itself).
         mapper: name of the mapping method, or `NO_MAPPER`: tracks of verified matches stand for
             3D points. That is fast and lacks poses and the filter of a reconstruction.
-        seed: of retrieval and mapping.
     """
 
     method: str = "bow"
-    k: int = 30
+    retrieval: RetrievalOptions = RetrievalOptions()
     output: Path | None = None
     databases: Path | None = None
     mapper: str = "incremental"
-    seed: int = 0
 
 
 @dataclass
@@ -307,13 +306,11 @@ def _matched_database(folder: SceneFolder, database: Path, options: AnnotateOpti
     from colmap_netvlad.matching.run import match_pairs
     from colmap_netvlad.pairs.union import union_of_top
     from colmap_netvlad.project import Project
-    from colmap_netvlad.retrieval.options import RetrievalOptions
     from colmap_netvlad.retrieval.rank import rank_project
 
     extract_features(folder.images, database)
-    retrieval = RetrievalOptions(k=options.k, seed=options.seed)
-    ranking = rank_project(Project(database, folder.images), options.method, retrieval)
-    pairs = union_of_top(ranking, options.k)
+    ranking = rank_project(Project(database, folder.images), options.method, options.retrieval)
+    pairs = union_of_top(ranking, options.retrieval.k)
     match_pairs(database, [(pair.name1, pair.name2) for pair in pairs])
     return options.method
 
@@ -324,7 +321,9 @@ def _map(
     from colmap_netvlad.mapping import MAPPERS
     from colmap_netvlad.mapping.options import MappingOptions
 
-    return MAPPERS[options.mapper](database, images, output, MappingOptions(seed=options.seed))
+    return MAPPERS[options.mapper](
+        database, images, output, MappingOptions(seed=options.retrieval.seed)
+    )
 
 
 def _images_of(model: pycolmap.Reconstruction, row_of: dict[str, int]) -> dict[int, int]:

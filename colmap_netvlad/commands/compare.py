@@ -63,12 +63,29 @@ class CompareOptions:
     mapping: MappingOptions = field(default_factory=MappingOptions)
 
 
+@dataclass(frozen=True)
+class CompareReport:
+    """The result of `compare`.
+
+    Attributes:
+        comparison: all figures.
+        page, json, csv: where they stand: the report page, and the figures as tables.
+    """
+
+    comparison: Comparison
+    page: Path
+    json: Path
+    csv: Path
+
+
 def compare(
     project: Project,
     methods: Sequence[str],
     options: CompareOptions = CompareOptions(),
     confirm: Confirm = lambda question: False,
-) -> tuple[Comparison, Workspace]:
+    *,
+    k: Sequence[int] = (),
+) -> CompareReport:
     """Compare retrieval methods on one project, and write the report.
 
     The user's database is read only. Everything is kept in the comparison's folder: a killed run
@@ -78,14 +95,18 @@ def compare(
         methods: names of the table of methods, or checkpoints by path.
         confirm: asked with one question before an exhaustive matching that takes long.
 
+        k: shorthand for `options.k`.
+
     Returns:
-        The figures, and the folder with the page and tables. A method that fails is in
+        The figures, and where the page and the tables are. A method that fails is in
         `Comparison.incomplete`; the others are complete.
 
     Raises:
         InputError: no method, an unknown one, no features, k out of range, a folder that is not
             this project's comparison, or exhaustive matching that was not confirmed.
     """
+    if k:
+        options = replace(options, k=tuple(k))
     if not methods:
         raise InputError("No method to compare; name some in `methods`, bow and vlad for example.")
     texts = [_stable_text(text) for text in methods]
@@ -95,7 +116,7 @@ def compare(
 
 def _compare(
     flight: Flight, texts: Sequence[str], options: CompareOptions, confirm: Confirm
-) -> tuple[Comparison, Workspace]:
+) -> CompareReport:
     check_comparable(flight)
     project = flight.project
     ks = _checked_ks(options, len(flight.names))
@@ -117,7 +138,7 @@ def _compare(
     evidence = gather_evidence(flight, workspace, candidates, pairs[ks[-1]])
     comparison = compute_figures(flight, workspace, candidates, pairs, evidence, options.seed)
     write_report(workspace, comparison, evidence)
-    return comparison, workspace
+    return CompareReport(comparison, workspace.html, workspace.json, workspace.csv)
 
 
 def write_report(workspace: Workspace, comparison: Comparison, evidence: Evidence) -> None:

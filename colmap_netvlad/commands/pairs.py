@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from colmap_netvlad.cache.ranking import Ranking
 from colmap_netvlad.flight import open_flight
@@ -25,7 +26,7 @@ from colmap_netvlad.pairs.union import ImagePair, union_of_top
 from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval.fusion import similarity_matrix
 from colmap_netvlad.retrieval.options import COMPARED, RetrievalOptions
-from colmap_netvlad.retrieval.rank import rank
+from colmap_netvlad.retrieval.rank import export_descriptors, rank
 from colmap_netvlad.runtime.errors import InputError
 
 NO_RULES = PartnerRules()
@@ -67,6 +68,9 @@ def make_pairs(
     output: Path | None = None,
     rules: PartnerRules = NO_RULES,
     connect: bool = True,
+    export: Path | None = None,
+    *,
+    k: int | None = None,
 ) -> PairsReport:
     """Retrieve each image's k nearest partners and write the union as a pairs list.
 
@@ -83,6 +87,8 @@ def make_pairs(
             the same name ending in .csv.
         rules: cameras, sequences and pairs the user knows of; photos of one rig frame are never
             paired.
+        export: also write the method's global descriptors there, in hloc's HDF5 layout.
+        k: shorthand for `options.k`.
         connect: where the k nearest leave the images in several components, add the best pairs
             between these, at most `connecting_budget` of them.
 
@@ -90,6 +96,8 @@ def make_pairs(
         InputError: anything in the input a user can mend.
     """
     options = options or RetrievalOptions()
+    if k is not None:
+        options = replace(options, k=k)
     if format not in FORMATS:
         raise InputError(f"There is no format {format!r}; formats are {', '.join(FORMATS)}.")
     output = output or project.pairs.with_suffix(SUFFIXES[format])
@@ -98,13 +106,15 @@ def make_pairs(
     with open_flight(project) as flight:
         extra = _extra_pairs(flight.names, rules)
         ranking = rank(flight, method, options)
+        if export is not None:
+            export_descriptors(flight, method, options, export)
         frames = [flight.frames.get(image.image_id) for image in flight.images]
         cameras = [image.camera_id for image in flight.images]
         names, has_features = flight.names, bool(flight.descriptors)
     ranking = without_same_frame(ranking, frames)
-    k = min(options.k, len(names) - 1)
-    chosen = with_camera_quota(ranking, cameras, k, rules.other_cameras)
-    pairs = join_pairs(union_of_top(chosen, k), extra, names)
+    depth = min(options.k, len(names) - 1)
+    chosen = with_camera_quota(ranking, cameras, depth, rules.other_cameras)
+    pairs = join_pairs(union_of_top(chosen, depth), extra, names)
     links = _links(ranking, pairs) if connect else []
     pairs = in_order([*pairs, *links], names)
     unwritable = write_pairs(output, pairs, format)
@@ -144,6 +154,25 @@ def _extra_pairs(names: Sequence[str], rules: PartnerRules) -> list[tuple[str, s
     if rules.own_pairs is not None:
         extra += read_pairs(rules.own_pairs, names)
     return extra
+
+
+def as_json(report: PairsReport) -> dict[str, Any]:
+    """Return what `colmap-netvlad pairs --json` prints."""
+    ranking = report.ranking
+    return {
+        "images": len(ranking.names),
+        "method": ranking.method,
+        "k": ranking.depth,
+        "pairs": len(report.pairs),
+        "connecting": report.connecting,
+        "components": report.components,
+        "seconds_describe": ranking.seconds_describe,
+        "seconds_search": ranking.seconds_search,
+        "notes": ranking.notes,
+        "left_out": [{"image": name, "reason": reason} for name, reason in ranking.left_out],
+        "output": report.output,
+        "colmap_list": report.colmap_list,
+    }
 
 
 def summary(project: Project, report: PairsReport) -> list[str]:

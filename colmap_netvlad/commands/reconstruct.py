@@ -6,16 +6,23 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
-from colmap_netvlad.colmap.database import copy_database, open_database
-from colmap_netvlad.graph.verified import verified_components
+from colmap_netvlad.colmap.database import image_names
+from colmap_netvlad.commands.match import (
+    MatchingReport,
+    PairsOrList,
+    RoundsOptions,
+    match,
+    view_graph_lines,
+)
+from colmap_netvlad.commands.match import as_json as match_json
 from colmap_netvlad.mapping import MAPPERS
 from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.mapping.output import free_output
 from colmap_netvlad.mapping.summary import ModelSummary, combine, registered_names, summarize
-from colmap_netvlad.matching.run import MatchOptions, MatchReport, match_pairs
-from colmap_netvlad.pairs.connect import apart_lines
-from colmap_netvlad.pairs.lists import read_pairs
+from colmap_netvlad.matching.rounds import rounds_lines
+from colmap_netvlad.matching.run import MatchOptions
 from colmap_netvlad.project import Project
 from colmap_netvlad.runtime.errors import InputError
 
@@ -33,7 +40,7 @@ class ReconstructOptions:
         matching: how pairs are matched.
     """
 
-    mapper: str = "incremental"
+    mapper: str = "auto"
     mapping: MappingOptions = MappingOptions()
     matching: MatchOptions = MatchOptions()
 
@@ -45,67 +52,50 @@ class ReconstructReport:
     Attributes:
         output: folder of the models.
         images: images in the database.
-        matches: report of the matching.
+        matching: report of the matching.
         models: figures of each model, in the order of their folders.
         total: figures of all models together.
         missing: names of the images without a pose in any model.
         seconds: duration by stage, s.
-        components: image names of each component of the verified view graph, largest first.
     """
 
     output: Path
     images: int
-    matches: MatchReport
+    matching: MatchingReport
     models: list[ModelSummary]
     total: ModelSummary
     missing: list[str] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
-    components: list[list[str]] = field(default_factory=list)
 
 
 def reconstruct(
     project: Project,
-    pairs: Path | None = None,
+    pairs: PairsOrList = None,
     output: Path | None = None,
     options: ReconstructOptions = ReconstructOptions(),
+    rounds: RoundsOptions | None = None,
 ) -> ReconstructReport:
-    """Match the pairs of a list, map, and write the sparse models.
+    """Match pairs, map, and write the sparse models.
 
     It writes matches into the project's database, where COLMAP keeps them. Pairs matched before
     are not matched again.
 
     Args:
         project: database and photos.
-        pairs: the pairs list; default: `pairs.txt` beside the database.
+        pairs: pairs of `make_pairs`, a pairs list or pairs of names; default: `pairs.txt` beside
+            the database.
         output: folder of the models; default: `sparse` beside the database, or `sparse-2`,
             `sparse-3`, ... where there are models already.
         options: mapper, seeds, limits.
+        rounds: choose pairs in rounds instead.
 
     Raises:
-        InputError: no pairs list, no features, an unknown mapper, or no model at all.
+        InputError: no pairs, no features, an unknown mapper, no pair that could be verified, or
+            no model at all.
     """
     check_mapper(options.mapper)
-    with open_database(project.database) as colmap:
-        names = [row.name for row in colmap.images()]
-    chosen = read_pairs(_existing(pairs or project.pairs), names)
-    if not chosen:
-        raise InputError(f"{pairs or project.pairs} lists no pairs; run `colmap-netvlad pairs`.")
-    matches = match_pairs(project.database, chosen, options.matching)
-    return map_and_report(project, matches, output, options)
-
-
-def map_and_report(
-    project: Project,
-    matches: MatchReport,
-    output: Path | None = None,
-    options: ReconstructOptions = ReconstructOptions(),
-) -> ReconstructReport:
-    """Map a database whose pairs are matched, and sum up.
-
-    Raises:
-        InputError: no pair was verified, or no model came out of it.
-    """
-    check_mapper(options.mapper)
+    matching = match(project, pairs, rounds, options.matching)
+    matches = matching.matches
     if not matches.verified:
         raise InputError(
             f"None of the {matches.requested} pairs could be verified, so there is nothing to "
@@ -121,33 +111,16 @@ def map_and_report(
             "baseline to start from. More pairs (`k`) or more overlap may help."
         )
     registered = registered_names(models)
-    with open_database(project.database) as colmap:
-        names = [row.name for row in colmap.images()]
+    names = image_names(project.database)
     return ReconstructReport(
         output=target,
         images=len(names),
-        matches=matches,
+        matching=matching,
         models=[summarize(model) for model in models],
         total=combine(models),
         missing=[name for name in names if name not in registered],
         seconds=seconds,
-        components=verified_components(project.database),
     )
-
-
-def working_copy(project: Project) -> Project:
-    """Return the project on a copy of its database, `<name>.copy.db` beside it.
-
-    A copy of the same images and features is taken up again, with the matches in it; any other
-    is replaced.
-
-    Raises:
-        InputError: the copy cannot be written.
-    """
-    copy = project.database.with_suffix(".copy.db")
-    if not (copy.exists() and _features(copy) == _features(project.database)):
-        copy_database(project.database, copy, matches=True)
-    return Project(copy, project.images)
 
 
 def check_mapper(name: str) -> None:
@@ -157,16 +130,18 @@ def check_mapper(name: str) -> None:
 
 
 def report_lines(report: ReconstructReport) -> list[str]:
-    """Return the report in lines: pairs, minutes of each stage, images left out."""
-    matches = report.matches
+    """Return the report in lines: rounds, pairs, minutes of each stage, images left out."""
+    matching = report.matching
+    matches = matching.matches
     lines = [
+        *(rounds_lines(matching.rounds) if matching.rounds else []),
         f"Pairs: {matches.requested:,} ({matches.already:,} matched before, "
         f"{matches.matched:,} now), {matches.verified:,} verified.",
         "Minutes: "
         + ", ".join(f"{stage} {time / 60:.1f}" for stage, time in report.seconds.items())
         + f", together {sum(report.seconds.values()) / 60:.1f}.",
+        *view_graph_lines(matching.components),
     ]
-    lines += view_graph_lines(report.components)
     if report.missing:
         lines.append(
             f"Not registered: {len(report.missing)} of {report.images} images: "
@@ -175,31 +150,20 @@ def report_lines(report: ReconstructReport) -> list[str]:
     return lines
 
 
-def view_graph_lines(groups: Sequence[Sequence[str]]) -> list[str]:
-    """Return which images no verified pair joins to the rest, or nothing."""
-    if len(groups) < 2:
-        return []
-    return [
-        f"View graph: {len(groups)} components; apart from the largest of {len(groups[0]):,} "
-        "images are (a larger `k`, or `rounds`, may join them):",
-        *(f"  {line}" for line in apart_lines(groups)),
-    ]
+def as_json(report: ReconstructReport) -> dict[str, Any]:
+    """Return what `colmap-netvlad reconstruct --json` prints."""
+    return {
+        "output": report.output,
+        "images": report.images,
+        "registered": report.total.registered,
+        "total": report.total,
+        "models": report.models,
+        "missing": report.missing,
+        "seconds": report.seconds,
+        **match_json(report.matching),
+    }
 
 
 def _first(names: Sequence[str]) -> str:
     shown = ", ".join(names[:MISSING_SHOWN])
     return shown if len(names) <= MISSING_SHOWN else f"{shown}, ..."
-
-
-def _existing(pairs: Path) -> Path:
-    if not pairs.is_file():
-        raise InputError(
-            f"There is no pairs list {pairs}; make it with `colmap-netvlad pairs`, or name one "
-            "with `pairs`."
-        )
-    return pairs
-
-
-def _features(database: Path) -> tuple[list[tuple[int, str]], dict[int, int]]:
-    with open_database(database) as colmap:
-        return [(row.image_id, row.name) for row in colmap.images()], colmap.keypoint_counts()

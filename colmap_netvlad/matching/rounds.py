@@ -23,8 +23,6 @@ from colmap_netvlad.pairs.connect import connecting_budget, connecting_pairs
 from colmap_netvlad.pairs.rounds import FITTED, next_round, split_budget
 from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval.fusion import similarity_matrix
-from colmap_netvlad.retrieval.options import RetrievalOptions
-from colmap_netvlad.retrieval.rank import rank_project
 from colmap_netvlad.runtime.errors import InputError
 
 PLAN_SETTING = "rounds"
@@ -90,27 +88,6 @@ def match_in_rounds(
     ids = _check(project, ranking, budget, rounds)
     plan = _Plan.load(project, ranking, budget, rounds)
     return _Run(project, ranking, budget, rounds, matching, ids, plan).spend()
-
-
-def rank_and_match_in_rounds(
-    project: Project,
-    method: str,
-    options: RetrievalOptions,
-    rounds: int,
-    budget: int | None = None,
-    matching: MatchOptions = MatchOptions(),
-) -> RoundsReport:
-    """Rank deeply by a method and match in rounds; see `match_in_rounds`.
-
-    Args:
-        options: `k` sets the budget where none is given: k times the number of images.
-
-    Raises:
-        InputError: as `rank` and `match_in_rounds`.
-    """
-    ranking = rank_project(project, method, options)
-    spend = plan_budget(options.k, len(ranking.names)) if budget is None else budget
-    return match_in_rounds(project, ranking, spend, rounds, matching)
 
 
 def rounds_lines(report: RoundsReport) -> list[str]:

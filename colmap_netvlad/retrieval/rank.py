@@ -10,7 +10,7 @@ from colmap_netvlad.flight import Flight, open_flight
 from colmap_netvlad.photos.positions import Positions
 from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval.gps import near_first
-from colmap_netvlad.retrieval.methods import Method, deep, find_method
+from colmap_netvlad.retrieval.methods import Method, deep, find_method, hdf5
 from colmap_netvlad.retrieval.options import (
     GPS_MODES,
     SEARCH_DEPTH,
@@ -74,6 +74,22 @@ def rank_project(
     """Open a project and `rank` its images."""
     with open_flight(project) as flight:
         return rank(flight, name, options, least_depth)
+
+
+def export_descriptors(
+    flight: Flight, name: str | Path, options: RetrievalOptions, file: Path
+) -> None:
+    """Write the global descriptors of a ranked flight in hloc's HDF5 layout.
+
+    Raises:
+        InputError: the method has no descriptors of its own, or the file cannot be written.
+    """
+    method = _method(name, options)
+    if method.model is None:
+        raise InputError(
+            f"{method.name} has no deep descriptors to export; choose a method that has a model."
+        )
+    hdf5.export(flight, options, options.model or method.model, file)
 
 
 def _method(name: str | Path, options: RetrievalOptions) -> Method:
