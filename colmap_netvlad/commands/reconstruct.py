@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from colmap_netvlad.colmap.database import copy_database, open_database
+from colmap_netvlad.colmap.copies import copy_database
+from colmap_netvlad.colmap.database import open_database
 from colmap_netvlad.graph.verified import verified_components
 from colmap_netvlad.mapping import MAPPERS
 from colmap_netvlad.mapping.options import MappingOptions

@@ -20,6 +20,7 @@ from pathlib import Path
 import pycolmap
 
 from colmap_netvlad.colmap import engine
+from colmap_netvlad.colmap.copies import copy_images
 from colmap_netvlad.graph.viewgraph import ViewGraph, read_view_graph
 from colmap_netvlad.mapping.incremental import pipeline_options
 from colmap_netvlad.mapping.merge import merge, read_sub_model
@@ -27,7 +28,6 @@ from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.mapping.output import model_folder
 from colmap_netvlad.mapping.partition import Cluster, partition
 from colmap_netvlad.mapping.refine import load_cache, rebuild, refine
-from colmap_netvlad.mapping.subset import write_subset
 from colmap_netvlad.runtime import progress, workers
 from colmap_netvlad.runtime.errors import InputError
 from colmap_netvlad.runtime.files import write_atomically
@@ -237,7 +237,7 @@ def map_cluster(
 ) -> None:
     """Map one cluster into `folder`/0, 1, ... (in a worker)."""
     subset = folder / "cluster.db"
-    write_subset(database, subset, names)
+    copy_images(database, subset, names)
     pipeline = pipeline_options(options, colors=False)
     pipeline.min_model_size = MIN_CLUSTER_MODEL
     pipeline.ba_global_frames_ratio = pipeline.ba_global_points_ratio = CLUSTER_GROWTH
