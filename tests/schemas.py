@@ -97,7 +97,15 @@ def add_images(path: Path, names: Sequence[str]) -> None:
         connection.commit()
 
 
-def fill(connection: sqlite3.Connection) -> None:
+def make_filled(path: Path, version: str) -> None:
+    """Write a database of a COLMAP version with the images `NAMES`."""
+    make_database(path, version)
+    with closing(sqlite3.connect(path)) as connection:
+        _fill(connection)
+        connection.commit()
+
+
+def _fill(connection: sqlite3.Connection) -> None:
     """Fill in the images `NAMES`: features in three, a verified and a failed pair, priors."""
     connection.execute("INSERT INTO cameras VALUES (1, 2, 400, 300, NULL, 0)")
     connection.executemany(

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from schemas import NAMES, VERSIONS, fill, make_database
+from schemas import NAMES, VERSIONS, make_database, make_filled
 
 from colmap_netvlad.colmap import copies
 from colmap_netvlad.colmap.copies import (
@@ -26,9 +26,8 @@ from colmap_netvlad.colmap.database import image_names, open_database, pair_id
 @pytest.fixture(params=VERSIONS)
 def source(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     path = tmp_path / "project.db"
-    make_database(path, request.param)
+    make_filled(path, request.param)
     with closing(sqlite3.connect(path)) as connection:
-        fill(connection)
         connection.execute("CREATE INDEX by_camera ON images (camera_id)")
         connection.commit()
     return path
@@ -165,10 +164,7 @@ def test_matches_of_some_pairs_replace_what_is_there(source: Path, tmp_path: Pat
 def test_more_keys_than_one_query_takes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(copies, "AT_ONCE", 2)
     source, target = tmp_path / "project.db", tmp_path / "copy.db"
-    make_database(source, "4.1")
-    with closing(sqlite3.connect(source)) as connection:
-        fill(connection)
-        connection.commit()
+    make_filled(source, "4.1")
     copy_images(source, target, NAMES)
     assert image_names(target) == NAMES
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from schemas import NAMES, VERSIONS, fill, make_database
+from schemas import NAMES, VERSIONS, make_filled
 
 from colmap_netvlad.colmap.database import (
     image_names,
@@ -25,10 +25,7 @@ from colmap_netvlad.runtime.errors import InputError
 @pytest.fixture(params=VERSIONS)
 def database(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     path = tmp_path / "project.db"
-    make_database(path, request.param)
-    with closing(sqlite3.connect(path)) as connection:
-        fill(connection)
-        connection.commit()
+    make_filled(path, request.param)
     return path
 
 

@@ -207,5 +207,6 @@ def test_the_report_shows_each_component_and_the_total(tmp_path: Path) -> None:
     assert models_table(report).row_count == 1
     assert models_table(replace(report, models=[model, model])).row_count == 3
     text = "\n".join(report_lines(report))
-    assert "15 of 20 images: 0.jpg" in text and "9.jpg, ..." in text and "10.jpg" not in text
+    assert "15 of 20 images: 0.jpg" in text and "9.jpg, and 5 more." in text
+    assert "10.jpg" not in text
     assert "matching 1.5" in text

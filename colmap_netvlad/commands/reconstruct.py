@@ -19,9 +19,7 @@ from colmap_netvlad.pairs.connect import apart_lines
 from colmap_netvlad.pairs.lists import read_pairs
 from colmap_netvlad.project import Project
 from colmap_netvlad.runtime.errors import InputError
-
-MISSING_SHOWN = 10
-"""Names of unregistered images that are printed."""
+from colmap_netvlad.runtime.sequences import listed
 
 
 @dataclass(frozen=True)
@@ -171,7 +169,7 @@ def report_lines(report: ReconstructReport) -> list[str]:
     if report.missing:
         lines.append(
             f"Not registered: {len(report.missing)} of {report.images} images: "
-            f"{_first(report.missing)}."
+            f"{listed(report.missing)}."
         )
     return lines
 
@@ -185,11 +183,6 @@ def view_graph_lines(groups: Sequence[Sequence[str]]) -> list[str]:
         "images are (a larger `k`, or `rounds`, may join them):",
         *(f"  {line}" for line in apart_lines(groups)),
     ]
-
-
-def _first(names: Sequence[str]) -> str:
-    shown = ", ".join(names[:MISSING_SHOWN])
-    return shown if len(names) <= MISSING_SHOWN else f"{shown}, ..."
 
 
 def _existing(pairs: Path) -> Path:
