@@ -18,8 +18,8 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-from colmap_netvlad.colmap.database import copy_database, image_names
-from colmap_netvlad.compare.models import copy_pairs
+from colmap_netvlad.colmap.copies import copy_database, copy_with_pairs
+from colmap_netvlad.colmap.database import image_names
 from colmap_netvlad.graph.pair import IndexPair, as_pair
 from colmap_netvlad.graph.verified import CORRECT_MATCHES, correct_pairs, verified_by_name
 from colmap_netvlad.mapping.incremental import map_incremental
@@ -63,7 +63,7 @@ def seconds_of_a_pair(project: Project, pairs: list[tuple[str, str]]) -> float:
 def model_row(project: Project, pairs: list[tuple[str, str]]) -> tuple[str, float]:
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder, "pairs.db")
-        copy_pairs(project.database, copy, {as_pair(*pair) for pair in pairs})
+        copy_with_pairs(project.database, copy, {as_pair(*pair) for pair in pairs})
         start = time.monotonic()
         models = map_incremental(copy, None, Path(folder, "sparse"), MappingOptions())
         seconds = time.monotonic() - start

@@ -27,6 +27,7 @@ from colmap_netvlad.commands.reconstruct import (
 from colmap_netvlad.mapping.incremental import map_incremental
 from colmap_netvlad.mapping.output import free_output
 from colmap_netvlad.mapping.summary import ModelSummary, combine, registered_names, summarize
+from colmap_netvlad.matching.run import MatchReport
 from colmap_netvlad.project import Project
 from colmap_netvlad.runtime.errors import InputError
 from colmap_netvlad.terminal import models_table
@@ -218,5 +219,6 @@ def test_the_report_shows_each_component_and_the_total(tmp_path: Path) -> None:
     assert models_table(report).row_count == 1
     assert models_table(replace(report, models=[model, model])).row_count == 3
     text = "\n".join(report_lines(report))
-    assert "15 of 20 images: 0.jpg" in text and "9.jpg, ..." in text and "10.jpg" not in text
+    assert "15 of 20 images: 0.jpg" in text and "9.jpg, and 5 more." in text
+    assert "10.jpg" not in text
     assert "matching 1.5" in text

@@ -8,7 +8,6 @@ next one.
 
 from __future__ import annotations
 
-import os
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -29,7 +28,7 @@ from colmap_netvlad.photos.files import (
 from colmap_netvlad.photos.masks import find_mask
 from colmap_netvlad.runtime import progress
 from colmap_netvlad.runtime.errors import InputError
-from colmap_netvlad.runtime.machine import usable_processors
+from colmap_netvlad.runtime.machine import usable_memory, usable_processors
 
 CHUNK_PHOTOS = 8
 """Photos of one chunk for each thread; the bar moves once a chunk."""
@@ -298,14 +297,9 @@ def _threads(options: FeatureOptions) -> int:
     """As many threads as processors, unless SIFT's scale space would fill half the memory."""
     if options.threads is not None:
         return options.threads
-    processors = usable_processors()
-    try:
-        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    except (AttributeError, ValueError, OSError):
-        return processors
     side = options.max_image_size or SIFT_LONG_SIDE
     scale_space = SIFT_LEVELS * 4 * (2 * side) * (2 * side) * 3 / 4
-    return max(1, min(processors, int(memory / 2 / scale_space)))
+    return max(1, min(usable_processors(), int(usable_memory() / 2 / scale_space)))
 
 
 def _report(

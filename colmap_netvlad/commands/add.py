@@ -21,6 +21,7 @@ from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval.options import RetrievalOptions
 from colmap_netvlad.retrieval.rank import rank_project
 from colmap_netvlad.runtime.errors import InputError
+from colmap_netvlad.runtime.sequences import listed
 
 
 @dataclass(frozen=True)
@@ -150,8 +151,7 @@ def add_lines(report: AddReport) -> list[str]:
     ]
     if report.unregistered:
         lines.append(
-            f"Not registered: {', '.join(report.unregistered[:10])}"
-            f"{', ...' if len(report.unregistered) > 10 else ''}; photos that overlap only other "
+            f"Not registered: {listed(report.unregistered)}; photos that overlap only other "
             "new ones need `among_new`, or new pairs and a new model."
         )
     return [*lines, f"The extended model is in {report.output}."]

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_netvlad.colmap.database import ImageRow, copy_database, open_database
+from colmap_netvlad.colmap.copies import copy_database
+from colmap_netvlad.colmap.database import ImageRow, open_database
 from colmap_netvlad.photos.files import (
     PHOTO_SUFFIXES,
     BadPhoto,

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from colmap_netvlad.colmap.database import copy_database, image_names, open_database
+from colmap_netvlad.colmap.copies import copy_database
+from colmap_netvlad.colmap.database import image_names, open_database
 from colmap_netvlad.commands.pairs import PairsReport
 from colmap_netvlad.graph.pair import Pair
 from colmap_netvlad.graph.verified import verified_components

@@ -196,7 +196,7 @@ def summary(project: Project, report: PairsReport) -> list[str]:
         )
     if report.has_features and ranking.method in CATALOGUE and len(ranking.names) > COMPARED + 1:
         lines.append(
-            "Better       --method hybrid looks for candidates by the database's SIFT features "
+            "Better       The method hybrid looks for candidates by the database's SIFT features "
             "too, and by GPS where there is any, for little time"
         )
     return [*lines, f"Next         {_next_command(project, report)}"]
@@ -207,13 +207,13 @@ def _component_lines(report: PairsReport) -> list[str]:
     if report.connecting:
         lines.append(
             f"Connecting   {report.connecting} pairs added between components that each image's "
-            f"{report.ranking.depth} nearest leave apart (--no-connect: none)"
+            f"{report.ranking.depth} nearest leave apart (`connect`)"
         )
     if len(groups) == 1:
         return [*lines, "Components   1: the pairs connect all images"]
     return [
         *lines,
-        f"Components   {len(groups)}: the pairs do not connect all images; a larger --k may. "
+        f"Components   {len(groups)}: the pairs do not connect all images; a larger `k` may. "
         f"The largest has {len(groups[0])} images; apart from it are:",
         *(f"             {line}" for line in apart_lines(groups)),
     ]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -25,9 +24,7 @@ from colmap_netvlad.matching.rounds import rounds_lines
 from colmap_netvlad.matching.run import MatchOptions
 from colmap_netvlad.project import Project
 from colmap_netvlad.runtime.errors import InputError
-
-MISSING_SHOWN = 10
-"""Names of unregistered images that are printed."""
+from colmap_netvlad.runtime.sequences import listed
 
 
 @dataclass(frozen=True)
@@ -145,7 +142,7 @@ def report_lines(report: ReconstructReport) -> list[str]:
     if report.missing:
         lines.append(
             f"Not registered: {len(report.missing)} of {report.images} images: "
-            f"{_first(report.missing)}."
+            f"{listed(report.missing)}."
         )
     return lines
 
@@ -162,8 +159,3 @@ def as_json(report: ReconstructReport) -> dict[str, Any]:
         "seconds": report.seconds,
         **match_json(report.matching),
     }
-
-
-def _first(names: Sequence[str]) -> str:
-    shown = ", ".join(names[:MISSING_SHOWN])
-    return shown if len(names) <= MISSING_SHOWN else f"{shown}, ..."

@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from colmap_netvlad.cache.ranking import Ranking
-from colmap_netvlad.colmap.database import copy_database
+from colmap_netvlad.colmap.copies import copy_database
 from colmap_netvlad.flight import Flight
 from colmap_netvlad.graph.pair import Pair
 from colmap_netvlad.runtime.errors import InputError

@@ -11,6 +11,7 @@ from colmap_netvlad.colmap.database import open_database
 from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.mapping.output import model_folder
 from colmap_netvlad.runtime import progress
+from colmap_netvlad.runtime.machine import usable_processors
 
 
 def map_incremental(
@@ -63,7 +64,5 @@ def pipeline_options(
     pipeline.random_seed = options.seed
     pipeline.mapper.random_seed = options.seed
     pipeline.triangulation.random_seed = options.seed
-    if options.threads is not None:
-        pipeline.num_threads = options.threads
-        pipeline.mapper.num_threads = options.threads
+    pipeline.num_threads = pipeline.mapper.num_threads = options.threads or usable_processors()
     return pipeline

@@ -11,7 +11,6 @@ import hashlib
 import json
 import logging
 import math
-import os
 import shutil
 import tempfile
 from collections.abc import Callable, Sequence
@@ -21,6 +20,7 @@ from pathlib import Path
 import pycolmap
 
 from colmap_netvlad.colmap import engine
+from colmap_netvlad.colmap.copies import copy_images
 from colmap_netvlad.graph.viewgraph import ViewGraph, read_view_graph
 from colmap_netvlad.mapping.incremental import pipeline_options
 from colmap_netvlad.mapping.merge import merge, read_sub_model
@@ -28,11 +28,10 @@ from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.mapping.output import model_folder
 from colmap_netvlad.mapping.partition import Cluster, partition
 from colmap_netvlad.mapping.refine import load_cache, rebuild, refine
-from colmap_netvlad.mapping.subset import write_subset
 from colmap_netvlad.runtime import progress, workers
 from colmap_netvlad.runtime.errors import InputError
 from colmap_netvlad.runtime.files import write_atomically
-from colmap_netvlad.runtime.machine import usable_processors
+from colmap_netvlad.runtime.machine import usable_memory, usable_processors
 
 logger = logging.getLogger(__name__)
 
@@ -238,7 +237,7 @@ def map_cluster(
 ) -> None:
     """Map one cluster into `folder`/0, 1, ... (in a worker)."""
     subset = folder / "cluster.db"
-    write_subset(database, subset, names)
+    copy_images(database, subset, names)
     pipeline = pipeline_options(options, colors=False)
     pipeline.min_model_size = MIN_CLUSTER_MODEL
     pipeline.ba_global_frames_ratio = pipeline.ba_global_points_ratio = CLUSTER_GROWTH
@@ -360,7 +359,7 @@ def worker_count(database: Path, largest: int, jobs: int, options: MappingOption
             database.
     """
     processors = options.threads or usable_processors()
-    memory = options.memory or MEMORY_SHARE * _machine_bytes()
+    memory = options.memory or MEMORY_SHARE * usable_memory()
     share = largest / max(1, _image_count(database))
     one = WORKER_BYTES + BYTES_PER_DATABASE_BYTE * share * database.stat().st_size
     return max(1, min(processors, jobs, math.floor(memory / one)))
@@ -371,13 +370,6 @@ def _image_count(database: Path) -> int:
 
     with open_database(database) as opened:
         return len(opened.images())
-
-
-def _machine_bytes() -> float:
-    try:
-        return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
-    except (AttributeError, ValueError, OSError):
-        return 8 * 2.0**30
 
 
 def _numbered(folder: Path) -> list[Path]:

@@ -17,6 +17,7 @@ from colmap_netvlad.mapping.output import model_folder
 from colmap_netvlad.mapping.parallel import CLUSTER_IMAGES, map_parallel
 from colmap_netvlad.runtime import workers
 from colmap_netvlad.runtime.errors import InputError
+from colmap_netvlad.runtime.machine import usable_processors
 
 logger = logging.getLogger(__name__)
 
@@ -74,7 +75,7 @@ def run_hierarchical(
     pipeline.incremental_options = pipeline_options(options, colors=images is not None)
     pipeline.clustering_options.leaf_max_num_images = size
     pipeline.clustering_options.image_overlap = max(3, math.ceil(OVERLAP_SHARE * size))
-    pipeline.num_threads = options.threads or -1
+    pipeline.num_threads = options.threads or usable_processors()
     models = pycolmap.hierarchical_mapping(database, images or folder, folder, options=pipeline)
     _write(models, folder)
 
@@ -90,7 +91,7 @@ def run_global(
     pipeline = pycolmap.GlobalPipelineOptions()
     pipeline.random_seed = options.seed
     pipeline.min_model_size = options.min_model_size
-    pipeline.num_threads = options.threads or -1
+    pipeline.num_threads = options.threads or usable_processors()
     models = pycolmap.global_mapping(database, images or folder, folder, options=pipeline)
     _write(models, folder)
 

@@ -13,7 +13,9 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
+from PIL import UnidentifiedImageError
+
+from colmap_netvlad.photos.files import open_header
 
 EARTH_RADIUS = 6_371_008.8
 """Mean radius of the earth, m."""
@@ -99,14 +101,12 @@ def place(found: Sequence[PosePrior | None], names: Sequence[str]) -> Positions:
 def read_gps(photo: Path) -> PosePrior | None:
     """Return a photo's EXIF GPS as a WGS84 prior, or None where it has none that is readable."""
     try:
-        with Image.open(photo) as image:
+        with open_header(photo) as image:
             gps = image.getexif().get_ifd(GPS_IFD)
         latitude = _degrees(gps[2], gps.get(1, "N"))
         longitude = _degrees(gps[4], gps.get(3, "E"))
         altitude = _altitude(gps)
     except (OSError, UnidentifiedImageError, KeyError, ValueError, TypeError, ZeroDivisionError):
-        return None
-    except Image.DecompressionBombError:
         return None
     if not np.isfinite([latitude, longitude]).all():
         return None

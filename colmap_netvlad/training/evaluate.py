@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from colmap_netvlad.colmap.database import copy_database
+from colmap_netvlad.colmap.copies import copy_database
 from colmap_netvlad.flight import open_flight
 from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval.options import RetrievalOptions

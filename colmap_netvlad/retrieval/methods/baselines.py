@@ -6,6 +6,7 @@ import numpy as np
 
 from colmap_netvlad.cache.ranking import Ranking
 from colmap_netvlad.flight import Flight
+from colmap_netvlad.graph.pair import places_by_name
 from colmap_netvlad.retrieval.options import RetrievalOptions
 from colmap_netvlad.runtime.errors import InputError
 
@@ -38,7 +39,7 @@ def chance(flight: Flight, options: RetrievalOptions, depth: int) -> Ranking:
     The draw depends on the seed and the names, not on the images' order.
     """
     names, count = flight.names, len(flight.images)
-    order = np.array(sorted(range(count), key=names.__getitem__), np.int32)
+    order = np.argsort(places_by_name(names)).astype(np.int32)
     partners = np.zeros((count, depth), np.int32)
     generator = np.random.default_rng(options.seed)
     for place, i in enumerate(order):

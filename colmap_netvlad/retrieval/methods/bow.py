@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_netvlad.cache.ranking import NO_PARTNER, Ranking
-from colmap_netvlad.colmap.database import copy_database
+from colmap_netvlad.colmap.copies import copy_database
 from colmap_netvlad.flight import Flight
 from colmap_netvlad.retrieval.methods.vlad import NO_FEATURES, sample_descriptors
 from colmap_netvlad.retrieval.options import RetrievalOptions
