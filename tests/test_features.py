@@ -190,8 +190,8 @@ def test_a_photo_without_texture_is_listed_and_stays(images: Path) -> None:
 
 def test_gps_of_photos_reaches_the_database(images: Path) -> None:
     exif = Image.Exif()
-    gps = exif.get_ifd(0x8825)
-    gps.update({1: "N", 2: (47.0, 30.0, 0.0), 3: "E", 4: (8.0, 15.0, 0.0), 5: b"\0", 6: 420.0})
+    place = {1: "N", 2: (47.0, 30.0, 0.0), 3: "E", 4: (8.0, 15.0, 0.0), 5: b"\0", 6: 420.0}
+    exif[0x8825] = place
     Image.fromarray(scene(7)).save(images / "gps.jpg", exif=exif)
     extract(images)
     with open_database(images.parent / "project.db") as database:
