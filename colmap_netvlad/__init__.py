@@ -13,6 +13,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from colmap_netvlad.runtime.libraries import keep_zlib_apart
+from colmap_netvlad.runtime.version import VERSION
 
 if TYPE_CHECKING:
     from colmap_netvlad.commands.add import add_photos
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
     from colmap_netvlad.runtime.errors import InputError
     from colmap_netvlad.runtime.progress import report_to
 
-__version__ = "0.1.0"
+__version__ = VERSION
 
 __all__ = [
     "InputError",

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from colmap_netvlad import __version__
 from colmap_netvlad.cli_options import (
     FILE,
     FOLDER,
@@ -42,6 +41,7 @@ from colmap_netvlad.cli_settings import SettingsCommand
 from colmap_netvlad.retrieval.options import RetrievalOptions
 from colmap_netvlad.runtime.errors import EXIT_PARTIAL
 from colmap_netvlad.runtime.plain import plain
+from colmap_netvlad.runtime.version import VERSION
 from colmap_netvlad.terminal import Group, say
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ def numbers(context: click.Context, parameter: click.Parameter, text: str) -> tu
     cls=Group,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
-@click.version_option(__version__, "--version", prog_name="colmap-netvlad")
+@click.version_option(VERSION, "--version", prog_name="colmap-netvlad")
 def cli() -> None:
     """Deep image pair retrieval for COLMAP on drone flights.
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import networkx as nx
 import pycolmap
 
-from colmap_netvlad import __version__, metrics
+from colmap_netvlad import metrics
 from colmap_netvlad.cache.ranking import Ranking
 from colmap_netvlad.compare import pool
 from colmap_netvlad.compare.evidence import Evidence
@@ -29,6 +29,7 @@ from colmap_netvlad.flight import Flight
 from colmap_netvlad.graph.pair import Pair
 from colmap_netvlad.graph.verified import correct_pairs, verified_by_name
 from colmap_netvlad.runtime.machine import usable_processors
+from colmap_netvlad.runtime.version import VERSION
 
 FULL_RANKING = 1000
 """Up to this many images every method ranks all others, so that average precision is the
@@ -173,7 +174,7 @@ def _left_out(ranking: Ranking) -> list[str]:
 
 def _versions() -> dict[str, str]:
     return {
-        "colmap-netvlad": __version__,
+        "colmap-netvlad": VERSION,
         "pycolmap": pycolmap.__version__,
         "Processor": f"{platform.machine()}, {usable_processors()} cores",
     }
