@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +18,8 @@ from PIL import UnidentifiedImageError
 
 from colmap_netvlad.photos.files import open_header
 
-EARTH_RADIUS = 6_371_008.8
-"""Mean radius of the earth, m."""
+if TYPE_CHECKING:
+    import pycolmap
 
 FAR_AWAY = 50_000.0
 """A photo farther than this from the middle of all others is not of this flight, m."""
@@ -189,21 +190,26 @@ def _middle(raw: NDArray[np.float64]) -> NDArray[np.float64] | None:
 
 
 def _metres_between(raw: NDArray[np.float64], middle: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (N,) distances from the middle in m; infinite off the globe, NaN where unknown."""
-    offset = np.radians(raw[:, :2] - middle)
-    offset[:, 1] *= np.cos(np.radians(middle[0]))
-    distance = EARTH_RADIUS * np.hypot(offset[:, 0], offset[:, 1])
+    """Return (N,) distances from the middle in m, straight through the earth and heights aside;
+    infinite off the globe, NaN where unknown."""
+    ground = np.vstack([raw[:, :2], middle])
+    on_earth = _earth().ellipsoid_to_ecef(np.column_stack([ground, np.zeros(len(ground))]))
+    distance = np.linalg.norm(on_earth[:-1] - on_earth[-1], axis=1)
     off_globe = (np.abs(raw[:, 0]) > 90) | (np.abs(raw[:, 1]) > 180)
     result: NDArray[np.float64] = np.where(off_globe, np.inf, distance)
     return result
 
 
 def _local_metres(raw: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return east, north, up in m around the middle (equirectangular: exact to 0.1 % at 50 km)."""
+    """Return east, north, up in m on the plane that touches the ellipsoid in the middle."""
     middle = _middle(raw)
     if middle is None:
         return np.full_like(raw, np.nan)
-    offset = np.radians(raw[:, :2] - middle)
-    east = EARTH_RADIUS * offset[:, 1] * np.cos(np.radians(middle[0]))
-    north = EARTH_RADIUS * offset[:, 0]
-    return np.column_stack([east, north, raw[:, 2]])
+    metres: NDArray[np.float64] = _earth().ellipsoid_to_enu(raw, middle[0], middle[1], 0.0)
+    return metres
+
+
+def _earth() -> pycolmap.GPSTransform:
+    import pycolmap  # takes seconds, and most photos' headers are read without it
+
+    return pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
