@@ -27,18 +27,18 @@ from colmap_netvlad.cache.store import Store
 from colmap_netvlad.colmap.database import copy_database, open_database
 from colmap_netvlad.colmap.features import FeatureOptions, extract_features
 from colmap_netvlad.commands.demo import DEMO_FLIGHT, MAX_FEATURES
-from colmap_netvlad.demo.render import Flight, flight_exists, read_flight, render_flight
+from colmap_netvlad.demo.render import RenderedFlight, flight_exists, read_flight, render_flight
 from colmap_netvlad.graph.verified import CORRECT_MATCHES
 from colmap_netvlad.graph.viewgraph import read_view_graph
 from colmap_netvlad.mapping.partition import partition
 from colmap_netvlad.matching.run import match_pairs
-from colmap_netvlad.models.catalogue import CATALOGUE, DEFAULT
+from colmap_netvlad.models.catalogue import DEFAULT
 from colmap_netvlad.pairs.rounds import FITTED, replay
 from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval.fusion import similarity_matrix
 from colmap_netvlad.retrieval.methods import deep
 from colmap_netvlad.retrieval.options import RetrievalOptions
-from colmap_netvlad.retrieval.rank import rank
+from colmap_netvlad.retrieval.rank import rank_project
 from colmap_netvlad.retrieval.rerank import TOLERANCE, TRANSFORMS, Places, agreeing_matches
 
 FIGURES = Path(__file__).parents[1] / "docs" / "figures"
@@ -59,7 +59,7 @@ APART = 0.6
 """Photos this share of the flight's extent apart show different ground."""
 
 
-def prepare(folder: Path) -> tuple[Flight, Project]:
+def prepare(folder: Path) -> tuple[RenderedFlight, Project]:
     """Render the demo's flight, extract features, and match every pair into a database."""
     rendered = flight_exists(folder, DEMO_FLIGHT)
     flight = read_flight(folder) if rendered else render_flight(folder, DEMO_FLIGHT)
@@ -72,14 +72,14 @@ def prepare(folder: Path) -> tuple[Flight, Project]:
 
 
 def places_of(project: Project, names: Iterable[str]) -> dict[str, tuple[Places, int, int]]:
-    """Return each photo's local features, and the grid's height and width."""
-    model = deep.model_fingerprint(CATALOGUE[DEFAULT].file())
+    """Return each photo's cells, and the grid's height and width."""
+    model = deep.cells_key(DEFAULT, RetrievalOptions())
     found = {}
     with Store(project.cache) as store:
-        numbers = store.local_numbers(model)
+        numbers = store.cell_numbers(model)
         for name in names:
-            local = store.read_local(numbers[name])
-            found[name] = Places.of(local), *local.codes.shape[:2]
+            cells = store.read_cells(numbers[name])
+            found[name] = Places.of(cells), *cells.codes.shape[:2]
     return found
 
 
@@ -102,7 +102,7 @@ def agreement(one: Places, other: Places) -> tuple[NDArray[np.intp], NDArray[np.
     return np.stack([mutual, best[mutual]], axis=1), agree
 
 
-def draw_places(flight: Flight, project: Project) -> Figure:
+def draw_places(flight: RenderedFlight, project: Project) -> Figure:
     """Two photos of one place, turned against each other, and two of different places."""
     number = {name: i for i, name in enumerate(flight.names)}
     places = places_of(project, flight.names)
@@ -136,7 +136,7 @@ def draw_places(flight: Flight, project: Project) -> Figure:
 
 def _draw_pair(
     axes: Axes,
-    flight: Flight,
+    flight: RenderedFlight,
     pair: tuple[str, str],
     places: dict[str, tuple[Places, int, int]],
     what: str,
@@ -164,16 +164,16 @@ def _draw_pair(
     axes.set_xlim(0, 2 * flight.width + gap)
     axes.set_ylim(flight.height, 0)
     axes.set_title(
-        f"{pair[0]} and {pair[1]}, {what}: of {len(matches)} places that are each other's most\n"
+        f"{pair[0]} and {pair[1]}, {what}: of {len(matches)} cells that are each other's most\n"
         f"alike, {int(agree.sum())} agree on one turn, scale and shift (green)",
         fontsize=10,
     )
     axes.axis("off")
 
 
-def draw_rounds(flight: Flight, project: Project) -> Figure:
+def draw_rounds(flight: RenderedFlight, project: Project) -> Figure:
     """Three rounds of pairs from above, replayed on the matches of all pairs."""
-    ranking = rank(project, DEFAULT, RetrievalOptions(k=len(flight.names) - 1))
+    ranking = rank_project(project, DEFAULT, RetrievalOptions(k=len(flight.names) - 1))
     with open_database(project.database) as database:
         place = {image.image_id: i for i, image in enumerate(database.images())}
         found = database.verified_matches()
@@ -212,7 +212,7 @@ def draw_rounds(flight: Flight, project: Project) -> Figure:
     return figure
 
 
-def draw_cut(flight: Flight, project: Project) -> Figure:
+def draw_cut(flight: RenderedFlight, project: Project) -> Figure:
     """The view graph cut into clusters, and the photos that neighbours share."""
     graph = read_view_graph(project.database)
     clusters = partition(graph, CLUSTER)
@@ -242,7 +242,7 @@ def draw_cut(flight: Flight, project: Project) -> Figure:
     return figure
 
 
-def _plan(flight: Flight, names: Iterable[str]) -> NDArray[np.float64]:
+def _plan(flight: RenderedFlight, names: Iterable[str]) -> NDArray[np.float64]:
     """Return (N, 2) m east and north of the photos' true centres."""
     centres = dict(zip(flight.names, flight.centres, strict=True))
     return np.array([centres[name][:2] for name in names])
@@ -271,7 +271,7 @@ def save(figure: Figure, path: Path, dpi: int = 130, colours: int = 200) -> None
 
 def main(folder: Path) -> None:
     flight, project = prepare(folder)
-    rank(project, DEFAULT, RetrievalOptions(k=10))  # describes the photos
+    rank_project(project, DEFAULT, RetrievalOptions(k=10))  # describes the photos
     FIGURES.mkdir(exist_ok=True)
     save(draw_places(flight, project), FIGURES / "places.png", dpi=100, colours=40)
     save(draw_rounds(flight, project), FIGURES / "rounds.png")

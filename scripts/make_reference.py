@@ -29,7 +29,7 @@ PACKAGE = "colmap_netvlad"
 FACE = {
     "open_project": "project",
     "extract_features": "colmap.features",
-    "rank": "retrieval.rank",
+    "rank_project": "retrieval.rank",
     "make_pairs": "commands.pairs",
     "match_pairs": "matching.run",
     "rank_and_match_in_rounds": "matching.rounds",
