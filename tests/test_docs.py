@@ -20,6 +20,12 @@ ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.glob("*.md"))]
 
+MEASURED = ("measurements.md", "model-card.md")
+"""Where figures are at home, with the commands that made them."""
+
+EXAMPLES = {"colour.py", "calibrated.py"}
+"""Files of CONTRIBUTING.md's examples."""
+
 README_LINES = 120
 FIGURE_BYTES = 300_000
 
@@ -82,6 +88,25 @@ def test_commands_in_the_text_exist_with_their_options(page: Path) -> None:
         }
         unknown = {word for word in words if word.startswith("-")} - known - {"--help"}
         assert not unknown, line
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_files_named_in_the_text_exist(page: Path) -> None:
+    named = re.findall(r"`(?:python )?([\w./-]+\.(?:py|toml))\b", page.read_text("utf-8"))
+    homes = (ROOT, ROOT / "colmap_netvlad", DOCS)
+    missing = {
+        name for name in named if not any((home / name).exists() for home in homes)
+    } - EXAMPLES
+    assert not missing
+
+
+@pytest.mark.parametrize("page", [ROOT / "README.md", DOCS / "index.md"], ids=lambda p: p.name)
+def test_figures_on_the_first_pages_stand_in_the_measurements(page: Path) -> None:
+    section = page.read_text("utf-8").split("## How good, how fast")[1].split("\n## ")[0]
+    measured = "".join((DOCS / name).read_text("utf-8") for name in MEASURED)
+    figures = set(re.findall(r"\d+\.\d+", section))
+    assert len(figures) > 4
+    assert {figure for figure in figures if figure not in measured} == set()
 
 
 def test_every_method_is_explained() -> None:
