@@ -10,7 +10,6 @@ docstrings there. `tests/test_docs.py` fails where a committed page is not what 
 from __future__ import annotations
 
 import dataclasses
-import importlib
 import inspect
 import types
 import typing
@@ -20,25 +19,13 @@ from typing import Any
 
 import click
 
+import colmap_netvlad
 from colmap_netvlad.cli import cli
 
 DOCS = Path(__file__).parents[1] / "docs"
 
-PACKAGE = "colmap_netvlad"
-
-FACE = {
-    "open_project": "project",
-    "extract_features": "colmap.features",
-    "rank_project": "retrieval.rank",
-    "make_pairs": "commands.pairs",
-    "match_pairs": "matching.run",
-    "rank_and_match_in_rounds": "matching.rounds",
-    "reconstruct": "commands.reconstruct",
-    "add_photos": "commands.add",
-    "compare": "commands.compare",
-    "read_view_graph": "graph.viewgraph",
-}
-"""Function -> the module of the package that has it, in the order of the work."""
+STEPS = ("open_project", "import_photos", "make_pairs", "match", "reconstruct", "add_photos")
+"""Public functions in the order of the work; the rest follows."""
 
 MAIN = ("features", "pairs", "match", "reconstruct", "add", "compare", "viewgraph", "methods")
 """Commands in the order of the work; the rest follows as the command line has it."""
@@ -58,9 +45,19 @@ PYTHON_HEAD = """\
 
 <!-- Made by scripts/make_reference.py from the package itself; do not edit. -->
 
+```python
+import colmap_netvlad as cn
+
+project = cn.open_project("project.db", images="photos")
+pairs = cn.make_pairs(project, k=30)
+model = cn.reconstruct(project, pairs)
+page = cn.compare(project, methods=["bow", "vlad", "netvlad-o-lite"], k=[10, 20])
+```
+
 Each command is one function. They raise `InputError` with one sentence where something in the
-input is wrong. A walk through them on a rendered flight:
-`examples/walkthrough.py`.
+input is wrong, log through `logging`, and print nothing. Importing before or after pycolmap makes
+no difference. A walk through them on a rendered flight: `examples/walkthrough.py`. What is not
+shown here is not promised to stay.
 """
 
 
@@ -129,26 +126,14 @@ def _meaning(option: click.Option) -> str:
     return text
 
 
-def public_names() -> dict[str, str]:
-    """Return the public names of the package and the module that has each."""
-    package = importlib.import_module(PACKAGE)
-    names = getattr(package, "__all__", None)
-    if names is None:
-        return {name: f"{PACKAGE}.{module}" for name, module in FACE.items()}
-    found = {name: getattr(package, name) for name in names if not name.startswith("__")}
-    return {name: thing.__module__ for name, thing in found.items()}
-
-
 def python_page() -> str:
     """Return the page of the public functions, and of the classes they take and return."""
-    names = public_names()
-    things = [getattr(importlib.import_module(module), name) for name, module in names.items()]
-    functions = [thing for thing in things if not inspect.isclass(thing)]
-    classes = [thing for thing in things if inspect.isclass(thing)]
+    names = dict.fromkeys((*STEPS, *colmap_netvlad.__all__))
+    public = [getattr(colmap_netvlad, name) for name in names]
+    functions = [thing for thing in public if not inspect.isclass(thing)]
+    classes = {thing for thing in public if inspect.isclass(thing)}
     for function in functions:
-        for found in _classes(function):
-            if found not in classes:
-                classes.append(found)
+        classes.update(_classes(function))
     lines = [PYTHON_HEAD, "## Functions", ""]
     lines += [_directive(function) for function in functions]
     lines += ["## What they take and return", ""]
@@ -166,7 +151,7 @@ def _classes(function: Any) -> Iterator[type]:
     while waiting:
         for hint in waiting.pop().values():
             for kind in _parts(hint):
-                ours = inspect.isclass(kind) and kind.__module__.startswith(PACKAGE)
+                ours = inspect.isclass(kind) and kind.__module__.startswith(colmap_netvlad.__name__)
                 if ours and dataclasses.is_dataclass(kind) and kind not in seen:
                     seen.add(kind)
                     waiting.append(typing.get_type_hints(kind))
