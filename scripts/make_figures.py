@@ -24,7 +24,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from colmap_netvlad.cache.store import Store
-from colmap_netvlad.colmap.database import copy_database, open_database
+from colmap_netvlad.colmap.copies import copy_database
+from colmap_netvlad.colmap.database import open_database
 from colmap_netvlad.colmap.features import FeatureOptions, extract_features
 from colmap_netvlad.commands.demo import DEMO_FLIGHT, MAX_FEATURES
 from colmap_netvlad.demo.render import RenderedFlight, flight_exists, read_flight, render_flight

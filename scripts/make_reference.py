@@ -57,7 +57,8 @@ page = cn.compare(project, methods=["bow", "vlad", "netvlad-o-lite"], k=[10, 20]
 Each command is one function. They raise `InputError` with one sentence where something in the
 input is wrong, log through `logging`, and print nothing. Importing before or after pycolmap makes
 no difference. A walk through them on a rendered flight: `examples/walkthrough.py`. What is not
-shown here is not promised to stay.
+shown here is not promised to stay. (On a repository page only names show; the site has the
+docstrings.)
 """
 
 
