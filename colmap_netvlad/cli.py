@@ -20,7 +20,6 @@ from colmap_netvlad.cli_options import (
     FILE,
     FOLDER,
     PATH,
-    copy_option,
     database_option,
     device_option,
     feature_options,
@@ -36,6 +35,7 @@ from colmap_netvlad.cli_options import (
     retrieval_options,
     seed_option,
     verbose_option,
+    written_project_options,
 )
 from colmap_netvlad.cli_settings import SettingsCommand
 from colmap_netvlad.retrieval.options import RetrievalOptions
@@ -209,14 +209,12 @@ def pairs(
 
 
 @cli.command()
-@project_options
-@copy_option
+@written_project_options
 @matching_options
 @json_option
 @verbose_option
 def match(
     project: Project,
-    copy: bool,
     pairs: Path | None,
     rounds: RoundsOptions | None,
     matching: MatchOptions,
@@ -229,10 +227,8 @@ def match(
     """
     from colmap_netvlad.commands.match import as_json as as_dictionary
     from colmap_netvlad.commands.match import match as run
-    from colmap_netvlad.commands.match import report_lines, working_copy
+    from colmap_netvlad.commands.match import report_lines
 
-    if copy:
-        project = working_copy(project)
     report = run(project, pairs, rounds, matching)
     if as_json:
         print_json({**as_dictionary(report), "database": project.database})
@@ -242,13 +238,12 @@ def match(
 
 
 @cli.command()
-@project_options
+@written_project_options
 @output_option(
     help="Folder of the models.  [default: sparse beside the database; sparse-2, sparse-3, ..."
     " where there are models already]",
 )
 @mapping_options
-@copy_option
 @matching_options
 @json_option
 @verbose_option
@@ -257,7 +252,6 @@ def reconstruct(
     output: Path | None,
     mapper: str,
     mapping: MappingOptions,
-    copy: bool,
     pairs: Path | None,
     rounds: RoundsOptions | None,
     matching: MatchOptions,
@@ -269,15 +263,12 @@ def reconstruct(
     COLMAP 3.x is brought to the schema of COLMAP 4. Pairs matched before are not matched again,
     so a stopped run goes on where it stopped.
     """
-    from colmap_netvlad.commands.match import working_copy
     from colmap_netvlad.commands.reconstruct import ReconstructOptions, check_mapper, report_lines
     from colmap_netvlad.commands.reconstruct import as_json as as_dictionary
     from colmap_netvlad.commands.reconstruct import reconstruct as run
     from colmap_netvlad.terminal import print_models
 
     check_mapper(mapper)
-    if copy:
-        project = working_copy(project)
     options = ReconstructOptions(mapper, replace(mapping, seed=matching.seed), matching)
     report = run(project, pairs, output, options, rounds)
     if as_json:

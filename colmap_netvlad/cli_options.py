@@ -158,6 +158,16 @@ def project_options(
     return {"project": open_project(database, images, cache)}
 
 
+@bundle(database_option, images_option, cache_option, copy_option)
+def written_project_options(copy: bool, **where: Path | None) -> dict[str, Any]:
+    """--db --images --cache --copy, as `project`: of a database that the command writes."""
+    from colmap_netvlad.commands.match import working_copy
+    from colmap_netvlad.project import open_project
+
+    project = open_project(**where)
+    return {"project": working_copy(project) if copy else project}
+
+
 RETRIEVAL: tuple[Callable[[Any], Any], ...] = (
     click.option(
         "--model",

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from colmap_netvlad.commands.reconstruct import ReconstructReport
-    from colmap_netvlad.compare.result import Comparison
+    from colmap_netvlad.comparison.result import Comparison
     from colmap_netvlad.mapping.summary import ModelSummary
 
 LOG_SECONDS = 30.0

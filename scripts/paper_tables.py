@@ -16,7 +16,7 @@ from pathlib import Path
 
 import click
 
-from colmap_netvlad.compare.result import Comparison, MethodResult, read_json
+from colmap_netvlad.comparison.result import Comparison, MethodResult, read_json
 from colmap_netvlad.terminal import Command
 
 Figure = str

@@ -56,7 +56,7 @@ def main(arguments: list[str]) -> int:
 def setup(arguments: list[str]) -> int:
     if not python_of(VENV).exists():
         make_venv(VENV)
-    package = ".[dev]" if "--dev" in arguments else "."
+    package = ".[dev,docs]" if "--dev" in arguments else "."
     install(VENV, "--constraint", "constraints.txt", "--editable", package)
     print(f"Ready: {program_of(VENV).relative_to(ROOT)}")
     return 0

@@ -27,7 +27,7 @@ FLOORS = [
     ["commands"],
     ["demo", "training"],
     ["report"],
-    ["compare"],
+    ["comparison"],
     ["mapping"],
     ["matching"],
     ["pairs"],

@@ -16,9 +16,9 @@ from click.testing import CliRunner
 from colmap_netvlad.cli import cli
 from colmap_netvlad.commands import compare as pipeline
 from colmap_netvlad.commands.compare import CompareOptions
-from colmap_netvlad.compare import models, pool
-from colmap_netvlad.compare.result import Comparison, read_json, write_json
-from colmap_netvlad.compare.workspace import Workspace, file_name, open_workspace
+from colmap_netvlad.comparison import models, pool
+from colmap_netvlad.comparison.result import Comparison, read_json, write_json
+from colmap_netvlad.comparison.workspace import Workspace, file_name, open_workspace
 from colmap_netvlad.flight import open_flight
 from colmap_netvlad.graph.verified import correct_pairs, verified_by_name
 from colmap_netvlad.mapping.options import MappingOptions

@@ -16,6 +16,7 @@ from colmap_netvlad.colmap import engine
 from colmap_netvlad.colmap import features as features_module
 from colmap_netvlad.colmap.database import ImageRow, open_database
 from colmap_netvlad.colmap.features import FeatureOptions, FeatureReport, extract_features
+from colmap_netvlad.demo.render import RenderedFlight
 from colmap_netvlad.project import open_project
 from colmap_netvlad.runtime.errors import EXIT_PARTIAL, InputError
 
@@ -129,7 +130,7 @@ def test_a_stopped_run_goes_on_with_the_next_photo(
     monkeypatch.setattr(engine, "call", stop_at_the_second)
     with pytest.raises(KeyboardInterrupt):
         extract(images)
-    assert set(rows(images)) == {"0.jpg"}
+    assert set(rows(images)) == {"0.jpg", "1.jpg"}, "the second is imported, not extracted"
     report = extract(images)
     assert (report.already, report.extracted, report.cameras) == (1, 2, 1)
     assert calls == [["0.jpg"], ["1.jpg"], ["1.jpg"], ["2.jpg"]]
@@ -226,3 +227,14 @@ def test_a_folder_without_photos_is_said(tmp_path: Path) -> None:
     (tmp_path / "images" / "notes.txt").write_text("no photo")
     with pytest.raises(InputError, match="There are no photos in"):
         extract(tmp_path / "images")
+
+
+def test_ids_follow_the_names_whatever_the_threads(flight: RenderedFlight, tmp_path: Path) -> None:
+    for name, threads in (("one.db", 1), ("three.db", 3)):
+        options = FeatureOptions(max_features=300, threads=threads)
+        extract_features(flight.images, tmp_path / name, options)
+    with open_database(tmp_path / "one.db") as one, open_database(tmp_path / "three.db") as three:
+        assert [image.name for image in one.images()] == sorted(flight.names)
+        assert one.images() == three.images()
+        assert one.keypoint_counts() == three.keypoint_counts()
+        assert one.feature_fingerprints() == three.feature_fingerprints()

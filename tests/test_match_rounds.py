@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from ranks import rank
 
 from colmap_netvlad.cache.ranking import Ranking
 from colmap_netvlad.colmap.database import image_names, open_database
@@ -18,17 +19,7 @@ from colmap_netvlad.matching import rounds as match_rounds
 from colmap_netvlad.matching.rounds import match_in_rounds, plan_budget
 from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval.options import RetrievalOptions
-from colmap_netvlad.retrieval.rank import rank_project
 from colmap_netvlad.runtime.errors import InputError
-
-
-def rank(
-    project: Project,
-    name: str | Path,
-    options: RetrievalOptions = RetrievalOptions(),
-) -> Ranking:
-    """Rank, cut to the k asked for."""
-    return rank_project(project, name, options).top(options.k)
 
 
 @pytest.fixture

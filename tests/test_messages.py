@@ -19,7 +19,7 @@ from colmap_netvlad.runtime.errors import InputError
 from colmap_netvlad.terminal import Command, Group, say
 
 PACKAGE = Path(colmap_netvlad.__file__).parent
-COMMAND_LINE = {"cli.py", "cli_settings.py", "terminal.py", "__main__.py"}
+COMMAND_LINE = {"cli.py", "cli_options.py", "cli_settings.py", "terminal.py", "__main__.py"}
 LIBRARY = [p for p in sorted(PACKAGE.rglob("*.py")) if p.name not in COMMAND_LINE]
 
 OPTION = re.compile(r"(?<![\w|-])--[a-z]")

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from ranks import rank
 from schemas import add_images, make_database
 
 from colmap_netvlad.cache.ranking import NO_PARTNER, Ranking
@@ -19,18 +20,7 @@ from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval import methods
 from colmap_netvlad.retrieval.methods import METHODS, bow, find_method, vlad
 from colmap_netvlad.retrieval.options import RetrievalOptions
-from colmap_netvlad.retrieval.rank import rank_project
 from colmap_netvlad.runtime.errors import InputError
-
-
-def rank(
-    project: Project,
-    name: str | Path,
-    options: RetrievalOptions = RetrievalOptions(),
-) -> Ranking:
-    """Rank, cut to the k asked for."""
-    return rank_project(project, name, options).top(options.k)
-
 
 MakeProject = Callable[..., Project]
 

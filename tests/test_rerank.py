@@ -10,26 +10,15 @@ from click.testing import CliRunner
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from ranks import rank
 
 from colmap_netvlad.cache.cells import Cells
 from colmap_netvlad.cache.ranking import NO_PARTNER, Ranking
 from colmap_netvlad.cache.store import Store
 from colmap_netvlad.cli import cli
-from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval import rerank as module
 from colmap_netvlad.retrieval.options import COMPARED, RetrievalOptions
-from colmap_netvlad.retrieval.rank import rank_project
 from colmap_netvlad.retrieval.rerank import CHANCE, Places, agreeing_matches, rerank
-
-
-def rank(
-    project: Project,
-    name: str | Path,
-    options: RetrievalOptions = RetrievalOptions(),
-) -> Ranking:
-    """Rank, cut to the k asked for."""
-    return rank_project(project, name, options).top(options.k)
-
 
 SIDE, STEP, PHOTOS = 12, 4, 9
 """A strip of ground seen by photos of SIDE x SIDE cells, each STEP cells after the one before."""

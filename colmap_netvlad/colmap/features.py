@@ -259,7 +259,6 @@ def _extract_group(
     images: Path, database: Path, group: _Group, options: FeatureOptions, bar: progress.Step
 ) -> None:
     reader = pycolmap.ImageReaderOptions()
-    reader.camera_model = options.camera_model
     if options.masks is not None:
         reader.mask_path = options.masks
     extraction = pycolmap.FeatureExtractionOptions()
@@ -270,21 +269,38 @@ def _extract_group(
     size = CHUNK_PHOTOS * extraction.num_threads
     for start in range(0, len(group.names), size):
         chunk = group.names[start : start + size]
-        if group.camera_id is not None:
-            reader.existing_camera_id = group.camera_id
+        _import(images, database, group, options, chunk)
         engine.call(
             pycolmap.extract_features,
             database.parent,
             database,
             images,
             image_names=chunk,
-            camera_mode=group.mode,
+            camera_mode=pycolmap.CameraMode.AUTO,
             reader_options=reader,
             extraction_options=extraction,
         )
-        if group.mode == pycolmap.CameraMode.SINGLE and group.camera_id is None:
-            group.camera_id = _camera_of(database, chunk)
         bar.advance(len(chunk))
+
+
+def _import(
+    images: Path, database: Path, group: _Group, options: FeatureOptions, names: Sequence[str]
+) -> None:
+    """Import the photos of a chunk that the database does not have yet.
+
+    Apart from the extraction, whose threads would number the photos in the order they finish:
+    ids follow the names, and two runs make the same database.
+    """
+    if group.mode == pycolmap.CameraMode.AUTO:
+        return
+    reader = pycolmap.ImageReaderOptions()
+    reader.camera_model = options.camera_model
+    if group.camera_id is not None:
+        reader.existing_camera_id = group.camera_id
+    pycolmap.Database.open(database).close()  # makes it where it is not there
+    pycolmap.import_images(database, images, group.mode, list(names), reader)
+    if group.mode == pycolmap.CameraMode.SINGLE and group.camera_id is None:
+        group.camera_id = _camera_of(database, names)
 
 
 def _camera_of(database: Path, names: Iterable[str]) -> int | None:

@@ -9,12 +9,17 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from colmap_netvlad import metrics
-from colmap_netvlad.compare import pool
-from colmap_netvlad.compare.evidence import Evidence
-from colmap_netvlad.compare.figures import FULL_RANKING, Candidate, compute_figures, gather_evidence
-from colmap_netvlad.compare.models import kept_figures, reconstruct_once
-from colmap_netvlad.compare.result import Comparison, ModelFigures, write_json
-from colmap_netvlad.compare.workspace import Workspace, check_comparable, open_workspace
+from colmap_netvlad.comparison import pool
+from colmap_netvlad.comparison.evidence import Evidence
+from colmap_netvlad.comparison.figures import (
+    FULL_RANKING,
+    Candidate,
+    compute_figures,
+    gather_evidence,
+)
+from colmap_netvlad.comparison.models import kept_figures, reconstruct_once
+from colmap_netvlad.comparison.result import Comparison, ModelFigures, write_json
+from colmap_netvlad.comparison.workspace import Workspace, check_comparable, open_workspace
 from colmap_netvlad.flight import Flight, open_flight
 from colmap_netvlad.graph.pair import Pair, as_pair
 from colmap_netvlad.mapping.options import MappingOptions

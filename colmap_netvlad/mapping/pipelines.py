@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pycolmap
@@ -40,26 +41,6 @@ def map_automatic(
         count = len(opened.keypoint_counts())
     mapper = map_parallel if count >= PARALLEL_IMAGES else map_incremental
     return mapper(database, images, output, options)
-
-
-def map_hierarchical(
-    database: Path,
-    images: Path | None,
-    output: Path,
-    options: MappingOptions = MappingOptions(),
-) -> list[pycolmap.Reconstruction]:
-    """Reconstruct with COLMAP's hierarchical mapper (see `incremental.map_incremental`)."""
-    return _map("hierarchically", run_hierarchical, database, images, output, options)
-
-
-def map_global(
-    database: Path,
-    images: Path | None,
-    output: Path,
-    options: MappingOptions = MappingOptions(),
-) -> list[pycolmap.Reconstruction]:
-    """Reconstruct with COLMAP's global mapper, GLOMAP (see `incremental.map_incremental`)."""
-    return _map("globally", run_global, database, images, output, options)
 
 
 def run_hierarchical(
@@ -102,7 +83,7 @@ def _map(
     database: Path,
     images: Path | None,
     output: Path,
-    options: MappingOptions,
+    options: MappingOptions = MappingOptions(),
 ) -> list[pycolmap.Reconstruction]:
     """Run a mapper that cannot be cancelled in a worker, which Ctrl-C ends."""
     with model_folder(output) as folder:
@@ -121,3 +102,10 @@ def _write(models: dict[int, pycolmap.Reconstruction], folder: Path) -> None:
         if not target.exists():
             target.mkdir()
             model.write(target)
+
+
+map_hierarchical = partial(_map, "hierarchically", run_hierarchical)
+"""COLMAP's hierarchical mapper (see `incremental.map_incremental`)."""
+
+map_global = partial(_map, "globally", run_global)
+"""COLMAP's global mapper, GLOMAP (see `incremental.map_incremental`)."""

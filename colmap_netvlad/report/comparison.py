@@ -6,7 +6,7 @@ import csv
 import io
 from pathlib import Path
 
-from colmap_netvlad.compare.result import EXHAUSTIVE, Comparison, MethodResult
+from colmap_netvlad.comparison.result import EXHAUSTIVE, Comparison, MethodResult
 from colmap_netvlad.report.measures import MEASURES
 from colmap_netvlad.runtime.files import write_atomically
 

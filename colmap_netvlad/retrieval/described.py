@@ -55,10 +55,10 @@ def rank_described(
         computed, whether now or in an earlier run.
     """
     described = [name for name in names if name not in left_out]
-    ranking = rank_vectors(
-        store.vectors(model, described), names, left_out, options, depth, method, notes
-    )
-    return replace(ranking, seconds_describe=store.seconds(model, described))
+    vectors = store.vectors(model, described)
+    ranking = rank_vectors(vectors, names, left_out, options, depth, method)
+    seconds = store.seconds(model, described)
+    return replace(ranking, seconds_describe=seconds, notes=tuple(notes))
 
 
 def rank_vectors(
@@ -68,7 +68,6 @@ def rank_vectors(
     options: RetrievalOptions,
     depth: int,
     method: str,
-    notes: Sequence[str] = (),
 ) -> Ranking:
     """Search the neighbours of all described images and rank them.
 
@@ -79,7 +78,6 @@ def rank_vectors(
         options: exact, seed.
         depth: partners of each image.
         method: name for the ranking.
-        notes: for the report.
     """
     rows = np.array([i for i, name in enumerate(names) if name not in left_out], np.int32)
     start = time.perf_counter()
@@ -94,6 +92,5 @@ def rank_vectors(
         scores,
         method,
         seconds_search=time.perf_counter() - start,
-        notes=tuple(notes),
         left_out=tuple(left_out.items()),
     )

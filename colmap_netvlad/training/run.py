@@ -106,17 +106,7 @@ def train(
             is not a number, or the disk is full.
     """
     check_disjoint([*scenes, *validation])
-    run = Run(
-        scenes,
-        validation,
-        options,
-        output,
-        device=device,
-        name=name,
-        metadata=metadata,
-        cache=cache,
-    )
-    return run.go()
+    return Run(scenes, validation, options, output, Card(device, name, metadata, cache)).go()
 
 
 def _check_points(scenes: Sequence[Scene], options: TrainOptions) -> None:
@@ -150,6 +140,16 @@ def report_lines(report: TrainReport) -> list[str]:
     return lines
 
 
+@dataclass(frozen=True)
+class Card:
+    """Where a run computes and what its model says of itself; see `train`."""
+
+    device: str | None = None
+    name: str | None = None
+    metadata: dict[str, Any] | None = None
+    cache: Path | None = None
+
+
 class Run:
     """A training run under way. Use `train`."""
 
@@ -159,17 +159,14 @@ class Run:
         validation: Sequence[Scene],
         options: TrainOptions,
         output: Path,
-        *,
-        device: str | None = None,
-        name: str | None = None,
-        metadata: dict[str, Any] | None = None,
-        cache: Path | None = None,
+        card: Card | None = None,
     ) -> None:
+        card = card or Card()
         self.options = options
         self.output = output
-        self.name = name or output.resolve().name
-        self.metadata = metadata or {}
-        self.device = choose_device(device)
+        self.name = card.name or output.resolve().name
+        self.metadata = card.metadata or {}
+        self.device = choose_device(card.device)
         self.validation_scenes = [scene.name for scene in validation]
         self.real_scenes = list(scenes)
         _check_points(self.real_scenes, options)
@@ -180,7 +177,7 @@ class Run:
         saved = self._load_checkpoint()
         self.network = SplitNetwork(self._build(saved), options.frozen).to(self.device)
         self.network.train(False)
-        cache = cache or output / "cache"
+        cache = card.cache or output / "cache"
         self.validation = Validation(validation, options.long_side, options.rotations, cache)
         self.inputs: Inputs = (
             KeptFeatures(self.photos, self.network, options, cache)

@@ -12,11 +12,11 @@ import pycolmap
 
 from colmap_netvlad import metrics
 from colmap_netvlad.cache.ranking import Ranking
-from colmap_netvlad.compare import pool
-from colmap_netvlad.compare.evidence import Evidence
-from colmap_netvlad.compare.finds import single_finds
-from colmap_netvlad.compare.models import read_plan
-from colmap_netvlad.compare.result import (
+from colmap_netvlad.comparison import pool
+from colmap_netvlad.comparison.evidence import Evidence
+from colmap_netvlad.comparison.finds import single_finds
+from colmap_netvlad.comparison.models import read_plan
+from colmap_netvlad.comparison.result import (
     EXHAUSTIVE,
     UNION,
     Comparison,
@@ -24,7 +24,7 @@ from colmap_netvlad.compare.result import (
     ModelFigures,
     RetrievalFigures,
 )
-from colmap_netvlad.compare.workspace import Workspace
+from colmap_netvlad.comparison.workspace import Workspace
 from colmap_netvlad.flight import Flight
 from colmap_netvlad.graph.pair import Pair
 from colmap_netvlad.graph.verified import correct_pairs, verified_by_name

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from colmap_netvlad.colmap.copies import copy_with_pairs
-from colmap_netvlad.compare.evidence import Plan
-from colmap_netvlad.compare.result import ModelFigures
+from colmap_netvlad.comparison.evidence import Plan
+from colmap_netvlad.comparison.result import ModelFigures
 from colmap_netvlad.graph.pair import Pair
 from colmap_netvlad.mapping.incremental import map_incremental
 from colmap_netvlad.mapping.options import MappingOptions
