@@ -35,8 +35,8 @@ CORE = [
     f"tests/test_{name}.py"
     for name in (
         "packaging", "store", "database", "search", "partners", "rerank", "pairs_command",
-        "features", "positions", "models_checkpoint", "matching", "match_rounds", "viewgraph",
-        "partition", "merge", "reconstruct", "add", "report", "losses", "real_colmap",
+        "face", "features", "positions", "models_checkpoint", "matching", "match_rounds",
+        "viewgraph", "partition", "merge", "reconstruct", "add", "report", "losses", "real_colmap",
     )
 ]  # fmt: skip
 """What is run on the lowest versions: each library's use, on the rendered flight."""
