@@ -45,8 +45,11 @@ from colmap_netvlad.runtime.version import VERSION
 from colmap_netvlad.terminal import Group, say
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from colmap_netvlad.colmap.features import FeatureOptions
     from colmap_netvlad.commands.match import RoundsOptions
+    from colmap_netvlad.commands.report import FlightReport
     from colmap_netvlad.mapping.options import MappingOptions
     from colmap_netvlad.matching.run import MatchOptions
     from colmap_netvlad.project import Project
@@ -244,6 +247,11 @@ def match(
     " where there are models already]",
 )
 @mapping_options
+@click.option(
+    "--drop-contradicted",
+    is_flag=True,
+    help="Leave out pairs of look-alike places: what the pairs around them or GPS contradict.",
+)
 @matching_options
 @json_option
 @verbose_option
@@ -252,6 +260,7 @@ def reconstruct(
     output: Path | None,
     mapper: str,
     mapping: MappingOptions,
+    drop_contradicted: bool,
     pairs: Path | None,
     rounds: RoundsOptions | None,
     matching: MatchOptions,
@@ -269,7 +278,8 @@ def reconstruct(
     from colmap_netvlad.terminal import print_models
 
     check_mapper(mapper)
-    options = ReconstructOptions(mapper, replace(mapping, seed=matching.seed), matching)
+    mapping = replace(mapping, seed=matching.seed)
+    options = ReconstructOptions(mapper, mapping, matching, drop_contradicted, command_line())
     report = run(project, pairs, output, options, rounds)
     if as_json:
         print_json({**as_dictionary(report), "database": project.database})
@@ -277,6 +287,7 @@ def reconstruct(
     print_models(report)
     say(*report_lines(report))
     click.echo(f"Matches are in {project.database}, models in {report.output}.")
+    say_verdict(report.quality)
 
 
 @cli.command()
@@ -326,10 +337,57 @@ def add(
         among_new,
         replace(features, masks=retrieval.masks),
         retrieval.seed,
+        command_line(),
     )
     report = add_photos(project, sparse, options, output)
     say(*add_lines(report))
+    say_verdict(report.quality)
     finish_partial([f"Left out: {name} {reason}" for name, reason in report.features.bad])
+
+
+@cli.command()
+@click.option(
+    "--sparse",
+    type=PATH,
+    required=True,
+    help="Folder of a COLMAP model, made by whomever; of several models in it the largest.",
+)
+@click.option(
+    "--db",
+    "--database_path",
+    "database",
+    type=PATH,
+    help="COLMAP database it was made from.  [default: project.db or database.db beside the model]",
+)
+@click.option(
+    "--images",
+    "--image_path",
+    "images",
+    type=PATH,
+    help="Folder that image names are relative to.  [default: images beside the database]",
+)
+@output_option(help="The page.  [default: report.html in the model's folder]")
+@verbose_option
+def report(sparse: Path, database: Path | None, images: Path | None, output: Path | None) -> None:
+    """Write the quality report of a model as one page, and say the verdict.
+
+    Database and photos are only read; what is missing (database, photos, GPS) the page says.
+    `reconstruct` and `add` write it beside every model they make.
+    """
+    from colmap_netvlad.commands.report import report as run
+
+    say_verdict([run(sparse, database, images, output)])
+
+
+def say_verdict(reports: Sequence[FlightReport]) -> None:
+    """Print the verdict on the largest model, and where the pages of smaller ones are."""
+    say(*(reports[0].lines if reports else ()))
+    say(*(f"Report of a smaller model: {other.page}" for other in reports[1:]))
+
+
+def command_line() -> str:
+    """Return the command as the user gave it."""
+    return shlex.join(["colmap-netvlad", *sys.argv[1:]])
 
 
 @cli.command()

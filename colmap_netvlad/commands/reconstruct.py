@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import tempfile
 import time
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from colmap_netvlad.colmap.copies import copy_with_pairs
 from colmap_netvlad.colmap.database import image_names
 from colmap_netvlad.commands.match import (
     MatchingReport,
@@ -16,6 +20,11 @@ from colmap_netvlad.commands.match import (
     view_graph_lines,
 )
 from colmap_netvlad.commands.match import as_json as match_json
+from colmap_netvlad.commands.report import FlightReport, report_models, run_of
+from colmap_netvlad.flight import open_flight
+from colmap_netvlad.graph.lookalikes import find_lookalikes
+from colmap_netvlad.graph.pair import Pair
+from colmap_netvlad.graph.verified import verified_by_name
 from colmap_netvlad.mapping import MAPPERS
 from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.mapping.output import free_output
@@ -35,11 +44,15 @@ class ReconstructOptions:
         mapper: name in `mapping.MAPPERS`.
         mapping: what the mapper is told.
         matching: how pairs are matched.
+        drop_contradicted: leave pairs that look like look-alikes out of the mapping.
+        command: the command line that asked for it, for the quality report.
     """
 
     mapper: str = "auto"
     mapping: MappingOptions = MappingOptions()
     matching: MatchOptions = MatchOptions()
+    drop_contradicted: bool = False
+    command: str = ""
 
 
 @dataclass(frozen=True)
@@ -54,6 +67,8 @@ class ReconstructReport:
         total: figures of all models together.
         missing: names of the images without a pose in any model.
         seconds: duration by stage, s.
+        dropped: contradicted pairs that were left out of the mapping.
+        quality: the quality report of each model, the largest first.
     """
 
     output: Path
@@ -63,6 +78,8 @@ class ReconstructReport:
     total: ModelSummary
     missing: list[str] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
+    dropped: list[Pair] = field(default_factory=list)
+    quality: list[FlightReport] = field(default_factory=list)
 
 
 def reconstruct(
@@ -72,7 +89,7 @@ def reconstruct(
     options: ReconstructOptions = ReconstructOptions(),
     rounds: RoundsOptions | None = None,
 ) -> ReconstructReport:
-    """Match pairs, map, and write the sparse models.
+    """Match pairs, map, and write the sparse models, each with its quality report.
 
     It writes matches into the project's database, where COLMAP keeps them. Pairs matched before
     are not matched again.
@@ -100,13 +117,18 @@ def reconstruct(
         )
     target = free_output(output or project.sparse)
     start = time.monotonic()
-    models = MAPPERS[options.mapper](project.database, project.images, target, options.mapping)
+    mapper = MAPPERS[options.mapper]
+    with mapping_database(project, options.drop_contradicted) as (database, dropped):
+        models = mapper(database, project.images, target, options.mapping)
     seconds = {"matching": matches.seconds, "mapping": time.monotonic() - start}
     if not models:
         raise InputError(
             f"No model came out of {matches.verified} verified pairs: none has enough inliers and "
             "baseline to start from. More pairs (`k`) or more overlap may help."
         )
+    run = run_of(options.command or "reconstruct, called from Python", seconds, asdict(options))
+    run = replace(run, dropped=len(dropped))
+    quality = report_models(target, project.database, project.images, run)
     registered = registered_names(models)
     names = image_names(project.database)
     return ReconstructReport(
@@ -117,7 +139,41 @@ def reconstruct(
         total=combine(models),
         missing=[name for name in names if name not in registered],
         seconds=seconds,
+        dropped=dropped,
+        quality=quality,
     )
+
+
+@contextmanager
+def mapping_database(project: Project, drop: bool) -> Iterator[tuple[Path, list[Pair]]]:
+    """Yield the database to map from, and the pairs it lacks.
+
+    Where contradicted pairs are to be dropped it is a copy without them, gone after the block:
+    the project's database keeps every match.
+    """
+    dropped = contradicted_pairs(project) if drop else []
+    if not dropped:
+        yield project.database, []
+        return
+    left_out = set(dropped)
+    kept = [pair for pair in verified_by_name(project.database) if pair not in left_out]
+    with tempfile.TemporaryDirectory(prefix=".lookalikes.", dir=project.folder) as folder:
+        copy = Path(folder) / project.database.name
+        copy_with_pairs(project.database, copy, kept)
+        yield copy, dropped
+
+
+def contradicted_pairs(project: Project) -> list[Pair]:
+    """Return the verified pairs that the pairs around them or GPS contradict.
+
+    Raises:
+        InputError: the database cannot be read.
+    """
+    with open_flight(project) as flight:
+        metres = flight.positions.metres
+        positions = dict(zip(flight.names, metres, strict=True))
+        found = find_lookalikes(flight.database, positions)
+    return [one.pair for one in found if one.contradicted]
 
 
 def check_mapper(name: str) -> None:
@@ -139,6 +195,10 @@ def report_lines(report: ReconstructReport) -> list[str]:
         + f", together {sum(report.seconds.values()) / 60:.1f}.",
         *view_graph_lines(matching.components),
     ]
+    if report.dropped:
+        lines.append(
+            f"Look-alikes: {len(report.dropped):,} contradicted pairs were left out of the mapping."
+        )
     if report.missing:
         lines.append(
             f"Not registered: {len(report.missing)} of {report.images} images: "
@@ -156,6 +216,8 @@ def as_json(report: ReconstructReport) -> dict[str, Any]:
         "total": report.total,
         "models": report.models,
         "missing": report.missing,
+        "dropped": report.dropped,
         "seconds": report.seconds,
+        "quality": [{"page": page.page, "verdict": page.verdict} for page in report.quality],
         **match_json(report.matching),
     }
