@@ -89,6 +89,12 @@ rerank_option = click.option(
     help="Candidates of each image that deep methods compare place by place; 0: none, the global"
     " descriptors alone as in the paper.",
 )
+sparse_option = click.option(
+    "--sparse",
+    type=click.Path(path_type=Path),
+    required=True,
+    help="A COLMAP model, or a folder of models 0, 1, ...",
+)
 copy_option = click.option(
     "--copy",
     is_flag=True,
@@ -252,6 +258,13 @@ def features(images: Path, database: Path, **options: Any) -> None:
     type=click.FloatRange(min=0, min_open=True),
     help="GiB that the workers of parallel mapping may take.  [default: 70 % of the machine's]",
 )
+@click.option(
+    "--georegister",
+    type=click.Choice(["auto", "off", "require"]),
+    default="auto",
+    show_default=True,
+    help="Whether the model is brought into the world, in m, by position priors or EXIF GPS.",
+)
 @copy_option
 @rounds_options
 @k_option
@@ -268,6 +281,7 @@ def reconstruct(
     cluster_size: int | None,
     threads: int | None,
     memory: float | None,
+    georegister: Any,
     copy: bool,
     rounds: int | None,
     budget: int | None,
@@ -309,7 +323,7 @@ def reconstruct(
         cluster_size=cluster_size,
         memory=None if memory is None else memory * 2**30,
     )
-    options = ReconstructOptions(mapper, mapping, MatchOptions(seed=seed))
+    options = ReconstructOptions(mapper, mapping, MatchOptions(seed=seed), georegister)
     if rounds is None:
         report = run(project, pairs, output, options)
     else:
@@ -452,6 +466,58 @@ def add(
     for line in add_lines(report):
         click.echo(line)
     finish_partial([f"Left out: {name} {reason}" for name, reason in report.features.bad])
+
+
+@cli.command()
+@sparse_option
+@click.option(
+    "--db",
+    "--database_path",
+    "database",
+    type=FILE,
+    help="COLMAP database, for its position priors.  [default: project.db or database.db beside"
+    " the model's folder, where there is one]",
+)
+@click.option(
+    "--images",
+    "--image_path",
+    "images",
+    type=FOLDER,
+    help="Photo folder, for EXIF GPS.  [default: images/ beside the model's folder, where there"
+    " is one]",
+)
+@click.option(
+    "--output",
+    "--output_path",
+    "output",
+    type=click.Path(path_type=Path),
+    help="Folder of the models in the world.  [default: the given one's name + -georegistered]",
+)
+@seed_option
+@verbose_option
+def georegister(
+    sparse: Path, database: Path | None, images: Path | None, output: Path | None, seed: int
+) -> None:
+    """Bring any COLMAP model into the world: m east, north, up of a stated origin.
+
+    The model is aligned robustly to position priors of a database or to EXIF GPS and written to
+    a new folder, with georeference.json (origin, EPSG code of the UTM zone, transform, residuals)
+    in it. A database is not needed: the photos' GPS is enough.
+    """
+    from colmap_netvlad.commands.georegister import beside
+    from colmap_netvlad.commands.georegister import georegister as run
+
+    database, images = beside(sparse, database, images)
+    report = run(sparse, output, database, images, seed)
+    for placed in report.models:
+        for line in placed.lines():
+            click.echo(f"{placed.name}: {line}")
+    for line in report.notes:
+        click.echo(line)
+    click.echo(f"Written to {report.output}.")
+    finish_partial(
+        [f"Left out: {one.name}: {one.fault}" for one in report.models if one.georeference is None]
+    )
 
 
 def quoted(path: Path) -> str:

@@ -6,10 +6,14 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 from rich.table import Table
 
-from colmap_netvlad.colmap.database import copy_database, open_database
+from colmap_netvlad.colmap.database import copy_database, image_names, open_database
+from colmap_netvlad.commands.georegister import Placed, georegister_in_place
+from colmap_netvlad.geo.align import MIN_PLACES
+from colmap_netvlad.geo.places import Places, find_places
 from colmap_netvlad.graph.verified import verified_components
 from colmap_netvlad.mapping import MAPPERS
 from colmap_netvlad.mapping.options import MappingOptions
@@ -33,11 +37,14 @@ class ReconstructOptions:
         mapper: name in `mapping.MAPPERS`.
         mapping: what the mapper is told.
         matching: how pairs are matched.
+        georegister: whether models are brought into the world: auto (where positions are known),
+            off, require.
     """
 
     mapper: str = "incremental"
     mapping: MappingOptions = MappingOptions()
     matching: MatchOptions = MatchOptions()
+    georegister: Literal["auto", "off", "require"] = "auto"
 
 
 @dataclass(frozen=True)
@@ -53,6 +60,9 @@ class ReconstructReport:
         missing: names of the images without a pose in any model.
         seconds: duration by stage, s.
         components: image names of each component of the verified view graph, largest first.
+        placed: where each model is in the world; empty where that was not asked or no position
+            is known.
+        notes: what was put aside among the positions.
     """
 
     output: Path
@@ -63,6 +73,8 @@ class ReconstructReport:
     missing: list[str] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
     components: list[list[str]] = field(default_factory=list)
+    placed: list[Placed] = field(default_factory=list)
+    notes: tuple[str, ...] = ()
 
 
 def reconstruct(
@@ -113,6 +125,7 @@ def map_and_report(
             f"None of the {matches.requested} pairs could be verified, so there is nothing to "
             "reconstruct; the photos may not overlap, or the pairs list be of other photos."
         )
+    places = _places(project, options)
     target = free_output(output or project.sparse)
     start = time.monotonic()
     models = MAPPERS[options.mapper](project.database, project.images, target, options.mapping)
@@ -122,9 +135,11 @@ def map_and_report(
             f"No model came out of {matches.verified} verified pairs: none has enough inliers and "
             "baseline to start from. More pairs (--k) or more overlap may help."
         )
+    placed = (
+        [] if places is None else georegister_in_place(target, places, seed=options.mapping.seed)
+    )
     registered = registered_names(models)
-    with open_database(project.database) as colmap:
-        names = [row.name for row in colmap.images()]
+    names = image_names(project.database)
     return ReconstructReport(
         output=target,
         images=len(names),
@@ -134,7 +149,29 @@ def map_and_report(
         missing=[name for name in names if name not in registered],
         seconds=seconds,
         components=verified_components(project.database),
+        placed=placed,
+        notes=() if places is None else places.notes,
     )
+
+
+def _places(project: Project, options: ReconstructOptions) -> Places | None:
+    """Return the known positions, or None where models stay where they are.
+
+    Raises:
+        InputError: a place in the world is required, and too few positions are known.
+    """
+    if options.georegister == "off":
+        return None
+    places = find_places(image_names(project.database), project.database, project.images)
+    if places.known >= MIN_PLACES:
+        return places
+    if options.georegister == "require":
+        raise InputError(
+            f"{places.known} of {len(places.names)} photos have a usable position, and "
+            f"--georegister require needs {MIN_PLACES}; nothing was mapped."
+            + "".join(f" {note}" for note in places.notes)
+        )
+    return None
 
 
 def working_copy(project: Project) -> Project:
@@ -189,6 +226,10 @@ def report_lines(report: ReconstructReport) -> list[str]:
         + f", together {sum(report.seconds.values()) / 60:.1f}.",
     ]
     lines += view_graph_lines(report.components)
+    for number, placed in enumerate(report.placed):
+        where = f"Model {number}: " if len(report.placed) > 1 else ""
+        lines += [where + line for line in placed.lines()]
+    lines += report.notes
     if report.missing:
         lines.append(
             f"Not registered: {len(report.missing)} of {report.images} images: "

@@ -13,11 +13,16 @@ import pycolmap
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from colmap_netvlad.geo.frames import Frame
+
 WIDTH, HEIGHT, FOCAL, RADIAL = 1000, 750, 800.0, -0.02
 """The true camera: SIMPLE_RADIAL, px."""
 
 FLYING_HEIGHT = 100.0
 """Above the mean ground, m."""
+
+FRAME = Frame(53.3811, -1.4701)
+"""Where the simulated flight is: truth is m east, north, up of here."""
 
 FORWARD, SIDE = 24.0, 45.0
 """Distance of photos in a line and of lines, m: overlaps of about 75 % and 65 %."""
@@ -37,6 +42,7 @@ class SimulationOptions:
         noise: standard deviation of a feature, px.
         partners: nearest photos that each photo is matched with.
         focal_error: relative error of the focal length that the database states.
+        gps: standard deviation of the position priors (WGS84), m; None: no priors.
         seed: seed of everything.
     """
 
@@ -49,6 +55,7 @@ class SimulationOptions:
     noise: float = 0.6
     partners: int = 20
     focal_error: float = 0.01
+    gps: float | None = None
     seed: int = 0
 
 
@@ -71,6 +78,8 @@ def simulate_flight(
     written = pycolmap.Database.open(database)
     with pycolmap.DatabaseTransaction(written):
         _write(rng, written, names, seen, rotations, centres, options)
+        if options.gps is not None:
+            _write_priors(written, names, centres, options.gps, options.seed)
     written.close()
     return dict(zip(names, centres, strict=True))
 
@@ -185,3 +194,21 @@ def _write(
         )
         database.write_matches(ids[i], ids[j], matches.astype(np.uint32))
         database.write_two_view_geometry(ids[i], ids[j], geometry)
+
+
+def _write_priors(
+    database: pycolmap.Database,
+    names: list[str],
+    centres: NDArray[np.float64],
+    deviation: float,
+    seed: int,
+) -> None:
+    """Write positions with noise as COLMAP does of EXIF GPS: WGS84, no covariance."""
+    noise = np.random.default_rng([seed, 1]).normal(0, deviation, centres.shape)
+    images = {image.name: image for image in database.read_all_images()}
+    for name, place in zip(names, FRAME.to_wgs84(centres + noise), strict=True):
+        prior = pycolmap.PosePrior()
+        prior.position = place
+        prior.coordinate_system = pycolmap.PosePriorCoordinateSystem.WGS84
+        prior.corr_data_id = images[name].data_id
+        database.write_pose_prior(prior)
