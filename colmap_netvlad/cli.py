@@ -265,6 +265,18 @@ def features(images: Path, database: Path, **options: Any) -> None:
     show_default=True,
     help="Whether the model is brought into the world, in m, by position priors or EXIF GPS.",
 )
+@click.option(
+    "--use-gps",
+    is_flag=True,
+    help="Adjust with the positions as priors, robustly: against drift and dome-shaped errors, and"
+    " for the focal length. Mappers incremental and parallel.",
+)
+@click.option(
+    "--gps-std",
+    type=(click.FloatRange(min=0, min_open=True),) * 2,
+    help="Standard deviations of the positions for --use-gps, m horizontal and vertical."
+    "  [default: what the database's priors, XMP (RTK) or EXIF state of each photo, else 3 and 5]",
+)
 @copy_option
 @rounds_options
 @k_option
@@ -282,6 +294,8 @@ def reconstruct(
     threads: int | None,
     memory: float | None,
     georegister: Any,
+    use_gps: bool,
+    gps_std: tuple[float, float] | None,
     copy: bool,
     rounds: int | None,
     budget: int | None,
@@ -311,7 +325,9 @@ def reconstruct(
     from colmap_netvlad.matching.run import MatchOptions
     from colmap_netvlad.project import find_project
 
-    check_mapper(mapper)
+    check_mapper(mapper, use_gps=use_gps)
+    if gps_std is not None and not use_gps:
+        raise click.UsageError("--gps-std says how good the positions of --use-gps are; add it.")
     project = find_project(database, images)
     pairs = pairs or project.pairs
     output = output or project.sparse
@@ -323,7 +339,9 @@ def reconstruct(
         cluster_size=cluster_size,
         memory=None if memory is None else memory * 2**30,
     )
-    options = ReconstructOptions(mapper, mapping, MatchOptions(seed=seed), georegister)
+    options = ReconstructOptions(
+        mapper, mapping, MatchOptions(seed=seed), georegister, use_gps, gps_std
+    )
     if rounds is None:
         report = run(project, pairs, output, options)
     else:

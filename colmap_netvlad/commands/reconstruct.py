@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 from rich.table import Table
 
 from colmap_netvlad.colmap.database import copy_database, image_names, open_database
 from colmap_netvlad.commands.georegister import Placed, georegister_in_place
 from colmap_netvlad.geo.align import MIN_PLACES
-from colmap_netvlad.geo.places import Places, find_places
+from colmap_netvlad.geo.places import Places, find_deviations, find_places
 from colmap_netvlad.graph.verified import verified_components
-from colmap_netvlad.mapping import MAPPERS
+from colmap_netvlad.mapping import MAPPERS, WITH_PRIORS
 from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.mapping.output import free_output
+from colmap_netvlad.mapping.priors import PositionPriors
 from colmap_netvlad.mapping.summary import ModelSummary, combine, registered_names, summarize
 from colmap_netvlad.matching.run import MatchOptions, MatchReport, match_pairs
 from colmap_netvlad.pairs.connect import apart_lines
@@ -39,12 +41,17 @@ class ReconstructOptions:
         matching: how pairs are matched.
         georegister: whether models are brought into the world: auto (where positions are known),
             off, require.
+        use_gps: adjust with the positions as priors.
+        gps_deviation: standard deviation of positions, m horizontal and vertical, for all
+            photos; None: what each photo states, else `geo.places.DEFAULT_DEVIATIONS`.
     """
 
     mapper: str = "incremental"
     mapping: MappingOptions = MappingOptions()
     matching: MatchOptions = MatchOptions()
     georegister: Literal["auto", "off", "require"] = "auto"
+    use_gps: bool = False
+    gps_deviation: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -98,7 +105,7 @@ def reconstruct(
     Raises:
         InputError: no pairs list, no features, an unknown mapper, or no model at all.
     """
-    check_mapper(options.mapper)
+    check_mapper(options.mapper, use_gps=options.use_gps)
     with open_database(project.database) as colmap:
         names = [row.name for row in colmap.images()]
     chosen = read_pairs(_existing(pairs or project.pairs), names)
@@ -119,16 +126,20 @@ def map_and_report(
     Raises:
         InputError: no pair was verified, or no model came out of it.
     """
-    check_mapper(options.mapper)
+    check_mapper(options.mapper, use_gps=options.use_gps)
     if not matches.verified:
         raise InputError(
             f"None of the {matches.requested} pairs could be verified, so there is nothing to "
             "reconstruct; the photos may not overlap, or the pairs list be of other photos."
         )
     places = _places(project, options)
+    mapping = options.mapping
+    priors_note: tuple[str, ...] = ()
+    if options.use_gps and places is not None:
+        mapping, priors_note = _with_priors(project, places, options)
     target = free_output(output or project.sparse)
     start = time.monotonic()
-    models = MAPPERS[options.mapper](project.database, project.images, target, options.mapping)
+    models = MAPPERS[options.mapper](project.database, project.images, target, mapping)
     seconds = {"matching": matches.seconds, "mapping": time.monotonic() - start}
     if not models:
         raise InputError(
@@ -136,7 +147,11 @@ def map_and_report(
             "baseline to start from. More pairs (--k) or more overlap may help."
         )
     placed = (
-        [] if places is None else georegister_in_place(target, places, seed=options.mapping.seed)
+        []
+        if places is None
+        else georegister_in_place(
+            target, places, adjusted=options.use_gps, seed=options.mapping.seed
+        )
     )
     registered = registered_names(models)
     names = image_names(project.database)
@@ -150,7 +165,7 @@ def map_and_report(
         seconds=seconds,
         components=verified_components(project.database),
         placed=placed,
-        notes=() if places is None else places.notes,
+        notes=(*priors_note, *(() if places is None else places.notes)),
     )
 
 
@@ -160,18 +175,39 @@ def _places(project: Project, options: ReconstructOptions) -> Places | None:
     Raises:
         InputError: a place in the world is required, and too few positions are known.
     """
-    if options.georegister == "off":
+    if options.georegister == "off" and not options.use_gps:
         return None
     places = find_places(image_names(project.database), project.database, project.images)
     if places.known >= MIN_PLACES:
         return places
-    if options.georegister == "require":
+    if options.georegister == "require" or options.use_gps:
+        asked = "--use-gps" if options.use_gps else "--georegister require"
         raise InputError(
             f"{places.known} of {len(places.names)} photos have a usable position, and "
-            f"--georegister require needs {MIN_PLACES}; nothing was mapped."
+            f"{asked} needs {MIN_PLACES}; nothing was mapped."
             + "".join(f" {note}" for note in places.notes)
         )
     return None
+
+
+def _with_priors(
+    project: Project, places: Places, options: ReconstructOptions
+) -> tuple[MappingOptions, tuple[str, ...]]:
+    """Return what the mapper is told with positions as priors, and a sentence on their accuracy."""
+    deviations, stating = find_deviations(
+        places.names, project.database, project.images, options.gps_deviation
+    )
+    priors = PositionPriors(places.names, places.metres, deviations)
+    if options.gps_deviation is not None:
+        source = "as given"
+    else:
+        source = f"{stating:,} state their own, the others have the default"
+    east, _, up = np.median(deviations, axis=0).tolist()
+    note = (
+        f"Adjusted with {places.known:,} positions; standard deviation {east:g} m horizontally, "
+        f"{up:g} m vertically in the median ({source})."
+    )
+    return replace(options.mapping, priors=priors), (note,)
 
 
 def working_copy(project: Project) -> Project:
@@ -189,10 +225,15 @@ def working_copy(project: Project) -> Project:
     return Project(copy, project.images)
 
 
-def check_mapper(name: str) -> None:
-    """Raise InputError unless `name` is a mapper."""
+def check_mapper(name: str, *, use_gps: bool = False) -> None:
+    """Raise InputError unless `name` is a mapper, and one that takes positions if they are used."""
     if name not in MAPPERS:
         raise InputError(f"There is no mapper {name}; choose {', '.join(MAPPERS)}.")
+    if use_gps and name not in WITH_PRIORS:
+        raise InputError(
+            f"The mapper {name} cannot adjust with positions; --use-gps works with "
+            f"{', '.join(WITH_PRIORS)}."
+        )
 
 
 def report_table(report: ReconstructReport) -> Table:

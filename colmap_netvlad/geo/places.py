@@ -110,6 +110,7 @@ def in_frame(
 
 def find_deviations(
     names: Sequence[str],
+    database: Path | None,
     images: Path | None,
     stated: tuple[float, float] | None = None,
 ) -> tuple[Array, int]:
@@ -117,19 +118,27 @@ def find_deviations(
 
     Args:
         names: of the photos.
-        images: photo folder, or None: then all have the default.
+        database: COLMAP database, whose priors' covariances come first.
+        images: photo folder, for what XMP and EXIF state.
         stated: horizontal and vertical standard deviation that the user gives for all.
     """
     deviations = np.tile(DEFAULT_DEVIATIONS, (len(names), 1))
     if stated is not None:
         return np.tile([stated[0], stated[0], stated[1]], (len(names), 1)), 0
-    count = 0
+    own = _prior_deviations(database) if database is not None else {}
     if images is not None and images.is_dir():
         with progress.step("Reading accuracy of GPS", len(names)) as bar:
-            for i, name in enumerate(names):
-                own = read_deviations(images / name)
-                if own is not None:
-                    deviations[i] = own
-                    count += 1
+            for name in names:
+                if name not in own:
+                    stating = read_deviations(images / name)
+                    own |= {} if stating is None else {name: stating}
                 bar.advance()
-    return deviations, count
+    for i, name in enumerate(names):
+        deviations[i] = own.get(name, DEFAULT_DEVIATIONS)
+    return deviations, sum(name in own for name in names)
+
+
+def _prior_deviations(database: Path) -> dict[str, tuple[float, float, float]]:
+    with open_database(database) as opened:
+        by_id = opened.position_deviations()
+        return {row.name: by_id[row.image_id] for row in opened.images() if row.image_id in by_id}

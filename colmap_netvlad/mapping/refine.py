@@ -97,6 +97,7 @@ def refine(
         options.get_mapper(),
         bundle_options(options),
         options.get_triangulation(),
+        normalize_reconstruction=not options.use_prior_position,
     )
     mapper.filter_frames(options.get_mapper())
     reached(0.9)
