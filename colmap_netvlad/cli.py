@@ -538,6 +538,58 @@ def georegister(
     )
 
 
+@cli.command()
+@sparse_option
+@click.option(
+    "--db",
+    "--database_path",
+    "database",
+    type=FILE,
+    help="COLMAP database, for the verified pairs.  [default: project.db or database.db beside the"
+    " model's folder; without one, pairs are those with common 3D points]",
+)
+@click.option(
+    "--format",
+    "formats",
+    multiple=True,
+    type=click.Choice(["cameras", "footprints", "pairs", "shots", "csv", "las", "ply", "text"]),
+    help="What to write; may be given several times.  [default: all]",
+)
+@click.option(
+    "--crs",
+    help="Projected system of CSV, LAS and shots: EPSG:25832 for example."
+    "  [default: the UTM zone of the model]",
+)
+@click.option(
+    "--output",
+    "--output_path",
+    "output",
+    type=click.Path(path_type=Path),
+    help="A new folder.  [default: the model's name + -export]",
+)
+def export(
+    sparse: Path,
+    database: Path | None,
+    formats: tuple[str, ...],
+    crs: str | None,
+    output: Path | None,
+) -> None:
+    """Write a georegistered model for other programs.
+
+    Cameras, footprints and pairs with weak links as GeoJSON, OpenDroneMap's shots.geojson,
+    cameras as CSV (easting, northing, height, omega, phi, kappa), points as LAS and PLY, and
+    COLMAP's text files.
+    """
+    from colmap_netvlad.commands.export import export as run
+    from colmap_netvlad.commands.georegister import beside
+
+    report = run(sparse, formats, output, beside(sparse, database, None)[0], crs)
+    for file in report.files:
+        click.echo(file)
+    system = "" if report.crs is None else f"; CSV, LAS and shots in {report.crs}"
+    click.echo(f"{len(report.files)} files in {report.output}{system}.")
+
+
 def quoted(path: Path) -> str:
     """Return a path as the user's shell takes it."""
     return shlex.quote(str(path))
