@@ -19,6 +19,7 @@ from colmap_netvlad.runtime.errors import EXIT_PARTIAL
 from colmap_netvlad.training.command import SettingsCommand
 
 if TYPE_CHECKING:
+    from colmap_netvlad.commands.georegister import ControlFile
     from colmap_netvlad.matching.run import MatchReport
     from colmap_netvlad.project import Project
 
@@ -119,6 +120,34 @@ def rounds_options(command: Command) -> Command:
     ):
         command = option(command)
     return command
+
+
+def gcp_options(command: Command) -> Command:
+    """Add the options of ground control."""
+    for option in (
+        click.option(
+            "--check",
+            multiple=True,
+            help="Name of a ground point that only checks the model; may be given several times.",
+        ),
+        click.option(
+            "--gcp",
+            type=FILE,
+            help="Ground points in OpenDroneMap's format (system, then x y z px py photo name):"
+            " they place the model and are held in a last adjustment.",
+        ),
+    ):
+        command = option(command)
+    return command
+
+
+def control_file(gcp: Path | None, check: tuple[str, ...]) -> ControlFile | None:
+    """Return what --gcp and --check name."""
+    from colmap_netvlad.commands.georegister import ControlFile
+
+    if gcp is None and check:
+        raise click.UsageError("--check names points of --gcp; give the list.")
+    return None if gcp is None else ControlFile(gcp, check)
 
 
 def verbose_option(command: Command) -> Command:
@@ -277,6 +306,7 @@ def features(images: Path, database: Path, **options: Any) -> None:
     help="Standard deviations of the positions for --use-gps, m horizontal and vertical."
     "  [default: what the database's priors, XMP (RTK) or EXIF state of each photo, else 3 and 5]",
 )
+@gcp_options
 @copy_option
 @rounds_options
 @k_option
@@ -296,6 +326,8 @@ def reconstruct(
     georegister: Any,
     use_gps: bool,
     gps_std: tuple[float, float] | None,
+    gcp: Path | None,
+    check: tuple[str, ...],
     copy: bool,
     rounds: int | None,
     budget: int | None,
@@ -340,7 +372,13 @@ def reconstruct(
         memory=None if memory is None else memory * 2**30,
     )
     options = ReconstructOptions(
-        mapper, mapping, MatchOptions(seed=seed), georegister, use_gps, gps_std
+        mapper,
+        mapping,
+        MatchOptions(seed=seed),
+        georegister,
+        use_gps,
+        gps_std,
+        control_file(gcp, check),
     )
     if rounds is None:
         report = run(project, pairs, output, options)
@@ -511,10 +549,17 @@ def add(
     type=click.Path(path_type=Path),
     help="Folder of the models in the world.  [default: the given one's name + -georegistered]",
 )
+@gcp_options
 @seed_option
 @verbose_option
 def georegister(
-    sparse: Path, database: Path | None, images: Path | None, output: Path | None, seed: int
+    sparse: Path,
+    database: Path | None,
+    images: Path | None,
+    output: Path | None,
+    gcp: Path | None,
+    check: tuple[str, ...],
+    seed: int,
 ) -> None:
     """Bring any COLMAP model into the world: m east, north, up of a stated origin.
 
@@ -526,7 +571,7 @@ def georegister(
     from colmap_netvlad.commands.georegister import georegister as run
 
     database, images = beside(sparse, database, images)
-    report = run(sparse, output, database, images, seed)
+    report = run(sparse, output, database, images, control_file(gcp, check), seed)
     for placed in report.models:
         for line in placed.lines():
             click.echo(f"{placed.name}: {line}")

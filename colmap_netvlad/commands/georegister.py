@@ -5,18 +5,44 @@ from __future__ import annotations
 import shutil
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 
 from colmap_netvlad.geo.align import ERROR_LADDER, Alignment, NotAligned, align, as_it_lies
+from colmap_netvlad.geo.frames import frame_of
+from colmap_netvlad.geo.gcp import (
+    ControlList,
+    adjust_to_control,
+    align_to_control,
+    measure_control,
+    read_control,
+)
 from colmap_netvlad.geo.georeference import Georeference, transformed
 from colmap_netvlad.geo.places import Places, find_places
 from colmap_netvlad.mapping.output import free_output, model_folder
 from colmap_netvlad.project import DATABASE_NAMES
 from colmap_netvlad.runtime.errors import InputError
+
+
+@dataclass(frozen=True)
+class ControlFile:
+    """A list of ground points to be read.
+
+    Attributes:
+        path: the list, in OpenDroneMap's format.
+        check: names of check points.
+    """
+
+    path: Path
+    check: tuple[str, ...] = ()
+
+    def read(self, photos: Sequence[str]) -> ControlList:
+        """Read it for a project's photos (see `geo.gcp.read_control`)."""
+        return read_control(self.path, photos, self.check)
+
 
 MODEL_FILES = ("images.bin", "images.txt")
 """Either says that a folder is a COLMAP model."""
@@ -63,6 +89,7 @@ def georegister(
     output: Path | None = None,
     database: Path | None = None,
     images: Path | None = None,
+    gcp: ControlFile | None = None,
     seed: int = 0,
 ) -> GeoregisterReport:
     """Bring models into the world and write them, with `georeference.json`, to a new folder.
@@ -72,6 +99,7 @@ def georegister(
         output: where they go, laid out as they were; default: `<sparse>-georegistered`.
         database: for position priors; None: EXIF alone.
         images: photo folder, for EXIF GPS.
+        gcp: ground points, which place the model instead of its positions.
         seed: of RANSAC.
 
     Raises:
@@ -80,8 +108,9 @@ def georegister(
     folders = find_models(sparse)
     models = [read_model(folder) for folder in folders]
     names = sorted({name for model in models for name in _poses(model)[0]})
-    places = find_places(names, database, images)
-    if not places.known:
+    control = None if gcp is None else gcp.read(names)
+    places = places_for(find_places(names, database, images), control)
+    if not places.known and control is None:
         asked = " and ".join(str(path) for path in (database, images) if path is not None)
         raise InputError(
             f"No position is known of any of the {len(names)} photos "
@@ -95,7 +124,7 @@ def georegister(
         for folder, model in zip(folders, models, strict=True):
             target = temporary if folder == sparse else temporary / folder.name
             target.mkdir(exist_ok=True)
-            placed.append(place_model(folder.name, model, places, target, seed=seed))
+            placed.append(place_model(folder.name, model, places, target, control, seed=seed))
         if not any(one.georeference for one in placed):
             raise InputError(f"No model of {sparse} could be georegistered: {placed[0].fault}")
         for one in placed:
@@ -105,13 +134,19 @@ def georegister(
 
 
 def georegister_in_place(
-    folder: Path, places: Places, *, adjusted: bool = False, seed: int = 0
+    folder: Path,
+    places: Places,
+    control: ControlList | None = None,
+    *,
+    adjusted: bool = False,
+    seed: int = 0,
 ) -> list[Placed]:
     """Bring the models that a mapper has just written into the world, where they are.
 
     Args:
         folder: of models 0, 1, ...
         places: known positions.
+        control: ground points, which place the models instead.
         adjusted: the mapper had these positions as priors, so the models are in their frame.
         seed: of RANSAC.
     """
@@ -120,7 +155,7 @@ def georegister_in_place(
         draft = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=folder))
         try:
             one = place_model(
-                path.name, read_model(path), places, draft, adjusted=adjusted, seed=seed
+                path.name, read_model(path), places, draft, control, adjusted=adjusted, seed=seed
             )
             if one.georeference is not None:
                 for file in sorted(draft.iterdir()):
@@ -136,6 +171,7 @@ def place_model(
     model: pycolmap.Reconstruction,
     places: Places,
     target: Path,
+    control: ControlList | None = None,
     *,
     adjusted: bool = False,
     seed: int = 0,
@@ -143,6 +179,8 @@ def place_model(
     """Align one model and write it to `target`; a model that cannot be placed is not written."""
     names, centres, rotations = _poses(model)
     known = places.of(names)
+    if control is not None and places.frame is not None:
+        return _place_by_control(name, model, places, target, control)
     try:
         alignment = align(names, centres, rotations, known, seed)
     except NotAligned as fault:
@@ -170,6 +208,47 @@ def beside(
         if images is None and (folder / "images").is_dir():
             images = folder / "images"
     return database, images
+
+
+def _place_by_control(
+    name: str,
+    model: pycolmap.Reconstruction,
+    places: Places,
+    target: Path,
+    control: ControlList,
+) -> Placed:
+    """Align one model to its control points, adjust it with them, and write it to `target`."""
+    frame = places.frame
+    assert frame is not None
+    try:
+        similarity = align_to_control(model, control, frame)
+    except NotAligned as fault:
+        return Placed(name, None, " ".join([fault.message, *control.notes]))
+    model = pycolmap.Reconstruction(model)
+    model.transform(similarity)
+    adjust_to_control(model, control, frame)
+    names, centres, _ = _poses(model)
+    alignment = replace(as_it_lies(names, centres, places.of(names)), world_from_model=similarity)
+    model.write(target)
+    georeference = Georeference(frame, alignment, control=measure_control(model, control, frame))
+    georeference.write(target)
+    return Placed(name, georeference)
+
+
+def places_for(places: Places, control: ControlList | None) -> Places:
+    """Return places in a frame on the globe where ground points need one.
+
+    Raises:
+        InputError: the positions are cartesian, so that ground points have no place among them.
+    """
+    if control is None or places.frame is not None:
+        return places
+    if places.known:
+        raise InputError(
+            "The database's position priors are cartesian, and ground points are on the globe; "
+            "the two do not go together."
+        )
+    return replace(places, frame=frame_of(control.geographic()))
 
 
 def find_models(sparse: Path) -> list[Path]:

@@ -12,8 +12,14 @@ import numpy as np
 from rich.table import Table
 
 from colmap_netvlad.colmap.database import copy_database, image_names, open_database
-from colmap_netvlad.commands.georegister import Placed, georegister_in_place
+from colmap_netvlad.commands.georegister import (
+    ControlFile,
+    Placed,
+    georegister_in_place,
+    places_for,
+)
 from colmap_netvlad.geo.align import MIN_PLACES
+from colmap_netvlad.geo.gcp import ControlList
 from colmap_netvlad.geo.places import Places, find_deviations, find_places
 from colmap_netvlad.graph.verified import verified_components
 from colmap_netvlad.mapping import MAPPERS, WITH_PRIORS
@@ -44,6 +50,7 @@ class ReconstructOptions:
         use_gps: adjust with the positions as priors.
         gps_deviation: standard deviation of positions, m horizontal and vertical, for all
             photos; None: what each photo states, else `geo.places.DEFAULT_DEVIATIONS`.
+        gcp: ground points, which place the models and are held in a last adjustment.
     """
 
     mapper: str = "incremental"
@@ -52,6 +59,7 @@ class ReconstructOptions:
     georegister: Literal["auto", "off", "require"] = "auto"
     use_gps: bool = False
     gps_deviation: tuple[float, float] | None = None
+    gcp: ControlFile | None = None
 
 
 @dataclass(frozen=True)
@@ -132,7 +140,8 @@ def map_and_report(
             f"None of the {matches.requested} pairs could be verified, so there is nothing to "
             "reconstruct; the photos may not overlap, or the pairs list be of other photos."
         )
-    places = _places(project, options)
+    control = None if options.gcp is None else options.gcp.read(image_names(project.database))
+    places = _places(project, control, options)
     mapping = options.mapping
     priors_note: tuple[str, ...] = ()
     if options.use_gps and places is not None:
@@ -150,7 +159,7 @@ def map_and_report(
         []
         if places is None
         else georegister_in_place(
-            target, places, adjusted=options.use_gps, seed=options.mapping.seed
+            target, places, control, adjusted=options.use_gps, seed=options.mapping.seed
         )
     )
     registered = registered_names(models)
@@ -169,25 +178,28 @@ def map_and_report(
     )
 
 
-def _places(project: Project, options: ReconstructOptions) -> Places | None:
+def _places(
+    project: Project, control: ControlList | None, options: ReconstructOptions
+) -> Places | None:
     """Return the known positions, or None where models stay where they are.
 
     Raises:
         InputError: a place in the world is required, and too few positions are known.
     """
-    if options.georegister == "off" and not options.use_gps:
+    if options.georegister == "off" and not options.use_gps and control is None:
         return None
     places = find_places(image_names(project.database), project.database, project.images)
+    places = places_for(places, control)
     if places.known >= MIN_PLACES:
         return places
-    if options.georegister == "require" or options.use_gps:
+    if options.use_gps or (options.georegister == "require" and control is None):
         asked = "--use-gps" if options.use_gps else "--georegister require"
         raise InputError(
             f"{places.known} of {len(places.names)} photos have a usable position, and "
             f"{asked} needs {MIN_PLACES}; nothing was mapped."
             + "".join(f" {note}" for note in places.notes)
         )
-    return None
+    return None if control is None else places
 
 
 def _with_priors(

@@ -12,6 +12,7 @@ import pycolmap
 
 from colmap_netvlad.geo.align import Alignment
 from colmap_netvlad.geo.frames import Frame
+from colmap_netvlad.geo.gcp import ControlReport
 from colmap_netvlad.geo.places import HEIGHTS
 from colmap_netvlad.runtime.errors import InputError
 from colmap_netvlad.runtime.files import write_atomically
@@ -28,11 +29,13 @@ class Georeference:
             database's priors.
         alignment: how it came there, and its residuals at the photos.
         adjusted: whether the positions were part of the bundle adjustment.
+        control: how ground points lie; None where there are none.
     """
 
     frame: Frame | None
     alignment: Alignment
     adjusted: bool = False
+    control: ControlReport | None = None
 
     def write(self, folder: Path) -> None:
         """Write `georeference.json` into a model's folder."""
@@ -49,12 +52,15 @@ class Georeference:
                 f"m east, north, up of {self.frame.latitude:.6f}, {self.frame.longitude:.6f} "
                 f"(UTM: EPSG {self.frame.epsg})"
             )
-        lines = [
-            f"Georegistered in {where}. {agreed:,} positions differ by "
-            f"{alignment.horizontal:.3f} m horizontally"
-            + ("" if math.isnan(vertical) else f" and {vertical:.3f} m vertically")
-            + " (root mean square)."
-        ]
+        lines = [f"Georegistered in {where}."]
+        if self.control is not None:
+            lines += self.control.lines()
+        if agreed:
+            lines.append(
+                f"{agreed:,} positions differ by {alignment.horizontal:.3f} m horizontally"
+                + ("" if math.isnan(vertical) else f" and {vertical:.3f} m vertically")
+                + " (root mean square)."
+            )
         if alignment.outliers.any():
             named = _outliers(alignment)
             shown = ", ".join(f"{name} ({size:.1f} m)" for name, size in named[:5])
@@ -84,6 +90,7 @@ class Georeference:
                 "vertical_rms": _number(alignment.vertical),
                 "outliers": [name for name, _ in _outliers(alignment)],
             },
+            "ground_points": None if self.control is None else _control(self.control),
             "notes": list(alignment.notes),
             "photos": {
                 name: [_number(value) for value in residual]
@@ -132,6 +139,29 @@ def _outliers(alignment: Alignment) -> list[tuple[str, float]]:
         for i in np.flatnonzero(alignment.outliers).tolist()
     ]
     return sorted(found, key=lambda item: (-item[1], item[0]))
+
+
+def _control(control: ControlReport) -> dict[str, object]:
+    points = zip(
+        control.names,
+        control.check.tolist(),
+        control.residuals.tolist(),
+        control.pixels.tolist(),
+        strict=True,
+    )
+    return {
+        "control_rms": [_number(value) for value in control.rms(check=False)],
+        "check_rms": [_number(value) for value in control.rms(check=True)],
+        "points": {
+            name: {
+                "check": check,
+                "residual": [_number(value) for value in residual],
+                "pixels": _number(pixels),
+            }
+            for name, check, residual, pixels in points
+        },
+        "notes": list(control.notes),
+    }
 
 
 def _number(value: float) -> float | None:
