@@ -635,6 +635,60 @@ def export(
     click.echo(f"{len(report.files)} files in {report.output}{system}.")
 
 
+@cli.command()
+@database_option
+@images_option
+@click.option(
+    "--sparse",
+    "sparse",
+    type=click.Path(path_type=Path),
+    multiple=True,
+    required=True,
+    help="A COLMAP model, or a folder of models 0, 1, ...; given twice or more.",
+)
+@click.option(
+    "--output",
+    "--output_path",
+    "output",
+    type=click.Path(path_type=Path),
+    help="Folder of the models.  [default: the next sparse-N beside the database]",
+)
+@click.option(
+    "--across",
+    type=click.IntRange(min=1),
+    default=10,
+    show_default=True,
+    help="Partners in other models that each image is matched with.",
+)
+@method_option
+@device_option
+@seed_option
+@verbose_option
+def merge(
+    database: Path | None,
+    images: Path | None,
+    sparse: tuple[Path, ...],
+    output: Path | None,
+    across: int,
+    method: str,
+    device: str | None,
+    seed: int,
+) -> None:
+    """Put models of one project together: several flights, days or heights.
+
+    Pairs across the models are retrieved, matched and verified (this writes the database); one
+    similarity is solved for all models at once, then all is adjusted together. Models that cannot
+    be joined stay and are named.
+    """
+    from colmap_netvlad.commands.merge import MergeOptions, merge_lines, merge_models
+    from colmap_netvlad.project import find_project
+    from colmap_netvlad.retrieval.options import RetrievalOptions
+
+    options = MergeOptions(method, RetrievalOptions(device=device, seed=seed), across, seed)
+    for line in merge_lines(merge_models(find_project(database, images), sparse, output, options)):
+        click.echo(line)
+
+
 def quoted(path: Path) -> str:
     """Return a path as the user's shell takes it."""
     return shlex.quote(str(path))
