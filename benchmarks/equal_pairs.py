@@ -18,8 +18,8 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-from colmap_netvlad.colmap.database import copy_database, image_names
-from colmap_netvlad.compare.models import copy_pairs
+from colmap_netvlad.colmap.copies import copy_database, copy_with_pairs
+from colmap_netvlad.colmap.database import image_names
 from colmap_netvlad.graph.pair import IndexPair, as_pair
 from colmap_netvlad.graph.verified import CORRECT_MATCHES, correct_pairs, verified_by_name
 from colmap_netvlad.mapping.incremental import map_incremental
@@ -32,7 +32,7 @@ from colmap_netvlad.pairs.rounds import FITTED, find_candidates, replay, take_tu
 from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval.fusion import similarity_matrix
 from colmap_netvlad.retrieval.options import RetrievalOptions
-from colmap_netvlad.retrieval.rank import rank
+from colmap_netvlad.retrieval.rank import rank_project
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 from fit_rounds import read_scene, truth_of
@@ -63,7 +63,7 @@ def seconds_of_a_pair(project: Project, pairs: list[tuple[str, str]]) -> float:
 def model_row(project: Project, pairs: list[tuple[str, str]]) -> tuple[str, float]:
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder, "pairs.db")
-        copy_pairs(project.database, copy, {as_pair(*pair) for pair in pairs})
+        copy_with_pairs(project.database, copy, {as_pair(*pair) for pair in pairs})
         start = time.monotonic()
         models = map_incremental(copy, None, Path(folder, "sparse"), MappingOptions())
         seconds = time.monotonic() - start
@@ -83,7 +83,7 @@ def measure(project: Project, k: int, vocab_tree: Path | None) -> None:
     correct_names = correct_pairs(verified_by_name(project.database))
     options = RetrievalOptions(k=len(names) - 1, vocab_tree=vocab_tree)
     rankings = {
-        (method, gps): rank(project, method, replace(options, gps=gps))
+        (method, gps): rank_project(project, method, replace(options, gps=gps))
         for _, method, gps, _ in APPROACHES
     }
     hybrid = rankings["hybrid", "auto"]

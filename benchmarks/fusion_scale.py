@@ -29,8 +29,8 @@ from colmap_netvlad.retrieval.methods.hybrid import (
     EXPANSION_NEIGHBOURS,
     EXPANSION_SHARE,
     VLAD_WEIGHT,
-    fusion_depth,
 )
+from colmap_netvlad.retrieval.options import SEARCH_DEPTH
 
 K = 30
 OVERLAP = 3.0
@@ -54,7 +54,7 @@ def simulated(ground: NDArray[np.float64], depth: int, seed: int) -> Ranking:
 def measure(size: int) -> None:
     side = int(np.ceil(np.sqrt(size)))
     ground = np.array([(i % side, i // side) for i in range(size)], dtype=np.float64)
-    depth = min(fusion_depth(K), size - 1)
+    depth = min(SEARCH_DEPTH, size - 1)
     rankings = [simulated(ground, depth, seed) for seed in (1, 2)]
     seconds: dict[str, float] = {}
 
@@ -69,7 +69,7 @@ def measure(size: int) -> None:
 
     start = time.perf_counter()
     positions = Positions(np.column_stack([ground, np.zeros(size)]), ())
-    ranking = near_first(ranking, positions, depth)
+    ranking = near_first(ranking, positions)
     seconds["GPS"] = time.perf_counter() - start
 
     start = time.perf_counter()

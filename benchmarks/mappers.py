@@ -26,6 +26,7 @@ from colmap_netvlad.colmap import engine
 from colmap_netvlad.mapping import MAPPERS
 from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.mapping.summary import combine
+from colmap_netvlad.terminal import Command
 
 NAMES = ("incremental", "parallel", "hierarchical", "global")
 
@@ -51,7 +52,7 @@ def offsets(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> np.ndar
     return np.linalg.norm(a @ matrix[:, :3].T + matrix[:, 3] - b, axis=1) / np.ptp(b, axis=0).max()
 
 
-@click.command()
+@click.command(cls=Command)
 @click.argument("database", type=click.Path(path_type=Path, exists=True))
 @click.option("--images", type=click.Path(path_type=Path, exists=True))
 @click.option("--cluster-size", default=60, show_default=True)

@@ -30,6 +30,7 @@ from colmap_netvlad.demo.simulate import SimulationOptions, simulate_flight
 from colmap_netvlad.mapping import MAPPERS
 from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.mapping.summary import summarize
+from colmap_netvlad.terminal import Command
 
 FIELDS = (
     "images", "mapper", "models", "registered", "points", "error_px",
@@ -118,7 +119,7 @@ def show(rows: list[dict[str, str]]) -> None:
     Console(width=150).print(table)
 
 
-@click.command()
+@click.command(cls=Command)
 @click.option("--sizes", default="100,250,500,1000,2000", show_default=True)
 @click.option("--mapper", "mappers", default="incremental,hierarchical,parallel")
 @click.option("--threads", default=2, show_default=True)

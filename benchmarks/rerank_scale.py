@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_netvlad.cache.cells import LocalFeatures
+from colmap_netvlad.cache.cells import Cells
 from colmap_netvlad.cache.ranking import Ranking
 from colmap_netvlad.cache.store import Store
 from colmap_netvlad.retrieval.options import COMPARED
@@ -54,7 +54,7 @@ def described(store: Store, side: int, rng: np.random.Generator) -> list[str]:
             seen = cut + NOISE * rng.standard_normal(cut.shape, np.float32)
             turned = np.rot90(seen, int(rng.integers(4)))
             batch.append(f"{y:03d}-{x:03d}.jpg")
-            local.append(LocalFeatures.of(turned.transpose(2, 0, 1)))
+            local.append(Cells.of(turned.transpose(2, 0, 1)))
         store.add_descriptors("m", batch, batch, np.zeros((side, 1)), 0, local)
         names += batch
     return names

@@ -18,6 +18,7 @@ import time
 from pathlib import Path
 
 from colmap_netvlad.colmap.features import extract_features
+from colmap_netvlad.flight import open_flight
 from colmap_netvlad.models.catalogue import CATALOGUE
 from colmap_netvlad.models.checkpoint import load_model
 from colmap_netvlad.photos.decode import load_batches
@@ -26,7 +27,7 @@ from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval.methods import bow
 from colmap_netvlad.retrieval.methods.deep import BATCH_SIZE
 from colmap_netvlad.retrieval.options import RetrievalOptions
-from colmap_netvlad.retrieval.rank import rank
+from colmap_netvlad.retrieval.rank import rank_project
 
 SCENE = Path(__file__).parents[1] / ".." / "shared" / "data" / "sheffield_cross"
 MODELS = ("netvlad-o", "netvlad-o-lite")
@@ -59,7 +60,8 @@ def main() -> None:
             extract_features(images, database)
         project = Project(database, images, Path(folder) / "cache.netvlad.db")
         start = time.perf_counter()
-        tree, note = bow.find_tree(project, options.vocab_tree, 0)
+        with open_flight(project) as flight:
+            tree, note = bow.find_tree(flight, options.vocab_tree, 0)
         print(f"{len(names)} photos, {os.cpu_count()} processors, load {os.getloadavg()[0]:.1f}")
         print(f"{note}: {time.perf_counter() - start:.0f} s\n")
         print("method                  describe   search    total   of it decoding   BoW / total")
@@ -69,7 +71,7 @@ def main() -> None:
             if method in CATALOGUE and not CATALOGUE[method].available:
                 print(f"{method:22}  its weights are not here")
                 continue
-            ranking = rank(project, method, RetrievalOptions(k=options.k, vocab_tree=tree))
+            ranking = rank_project(project, method, RetrievalOptions(k=options.k, vocab_tree=tree))
             described = ranking.seconds_describe / len(names)
             searched = ranking.seconds_search / len(names)
             total = described + searched

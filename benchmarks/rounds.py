@@ -26,7 +26,7 @@ from colmap_netvlad.pairs.rounds import FITTED, replay
 from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval.fusion import similarity_matrix
 from colmap_netvlad.retrieval.options import RetrievalOptions
-from colmap_netvlad.retrieval.rank import rank
+from colmap_netvlad.retrieval.rank import rank_project
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 from fit_rounds import read_scene, truth_of
@@ -65,7 +65,7 @@ def table(project: Project, methods: list[str], ks: list[int], options: Retrieva
     )
     print("|---|---|---|---|---|---|---|---|")
     for method in methods:
-        ranking = rank(project, method, replace(options, k=len(names) - 1))
+        ranking = rank_project(project, method, replace(options, k=len(names) - 1))
         similarity = similarity_matrix(ranking)
         for k in ks:
             chosen = one_round(ranking, k)

@@ -56,10 +56,10 @@ class Project:
         if self.images is None:
             raise InputError(
                 f"No photo folder is known for {self.database}: there is no "
-                f"{self.folder / 'images'}; say where the photos are with --images."
+                f"{self.folder / 'images'}; say where the photos are with `images`."
             )
         if not self.images.is_dir():
-            raise InputError(f"The photo folder {self.images} does not exist; mend --images.")
+            raise InputError(f"The photo folder {self.images} does not exist; mend `images`.")
         return self.images
 
 
@@ -74,56 +74,42 @@ def locate_database(database: Path | None, folder: Path | None = None) -> Path:
         found = [folder / name for name in DATABASE_NAMES if (folder / name).is_file()]
         if not found:
             raise InputError(
-                f"No {' or '.join(DATABASE_NAMES)} in {folder}; name the database with --db."
+                f"No {' or '.join(DATABASE_NAMES)} in {folder}; name one with `database`."
             )
         return found[0]
     if not database.exists():
-        raise InputError(f"The database {database} does not exist; mend --db.")
+        raise InputError(f"The database {database} does not exist; mend `database`.")
     if database.is_dir():
-        raise InputError(f"{database} is a folder; --db names the database file in it.")
+        raise InputError(f"{database} is a folder; `database` names the database file in it.")
     return database
 
 
 def open_project(
-    database: Path | None, images: Path | None = None, remembered: Path | None = None
+    database: str | Path | None = None,
+    images: str | Path | None = None,
+    cache: str | Path | None = None,
 ) -> Project:
-    """Locate a project.
+    """Locate a project; nothing is read of its database.
 
     Args:
         database: the COLMAP database, or None to look in the current folder.
-        images: the photo folder; default: `remembered` (from the cache), else `images/`
-            beside the database where it is a folder.
-
-    Raises:
-        InputError: no database, or a photo folder was given that does not exist.
-    """
-    database = locate_database(database)
-    if images is not None:
-        if not images.is_dir():
-            raise InputError(f"The photo folder {images} does not exist; mend --images.")
-        return Project(database, images)
-    for folder in (remembered, database.parent / "images"):
-        if folder is not None and folder.is_dir():
-            return Project(database, folder)
-    return Project(database, None)
-
-
-def find_project(
-    database: Path | None, images: Path | None = None, cache: Path | None = None
-) -> Project:
-    """Locate a project as the commands do: as `open_project`, with the photo folder that the
-    cache remembers.
-
-    Args:
-        database: the COLMAP database, or None to look in the current folder.
-        images: the photo folder, or None for the one used last, else `images/`.
+        images: the photo folder; default: the one that the cache remembers, else `images/` beside
+            the database where it is a folder.
         cache: our own file, or None for the one beside the database.
 
     Raises:
-        InputError: no database, no such photo folder, or a damaged cache.
+        InputError: no database, a photo folder was given that does not exist, or a damaged cache.
     """
     from colmap_netvlad.cache.store import remembered_images
 
-    database = locate_database(database)
-    remembered = remembered_images(Project(database, None, cache).cache)
-    return replace(open_project(database, images, remembered), cache_file=cache)
+    found = locate_database(None if database is None else Path(database))
+    project = Project(found, None, None if cache is None else Path(cache))
+    if images is not None:
+        folder = Path(images)
+        if not folder.is_dir():
+            raise InputError(f"The photo folder {folder} does not exist; mend `images`.")
+        return replace(project, images=folder)
+    for candidate in (remembered_images(project.cache), found.parent / "images"):
+        if candidate is not None and candidate.is_dir():
+            return replace(project, images=candidate)
+    return project

@@ -18,7 +18,7 @@ from colmap_netvlad.demo.render import FlightOptions, render_flight
 from colmap_netvlad.models.catalogue import DEFAULT
 from colmap_netvlad.project import open_project
 from colmap_netvlad.retrieval.options import RetrievalOptions
-from colmap_netvlad.retrieval.rank import rank
+from colmap_netvlad.retrieval.rank import rank_project
 
 
 def main(folder: Path, method: str = DEFAULT) -> None:
@@ -30,7 +30,7 @@ def main(folder: Path, method: str = DEFAULT) -> None:
     project = open_project(database, photos)
 
     # Photos -> global descriptors -> a ranking: the partners of each image, best first.
-    ranking = rank(project, method, RetrievalOptions(k=6))
+    ranking = rank_project(project, method, RetrievalOptions(k=6))
     best = ranking.names[ranking.partners[0, 0]]
     print(f"{ranking.names[0]} looks most like {best} (score {ranking.scores[0, 0]:.3f}).")
 

@@ -14,11 +14,12 @@ from pathlib import Path
 import click
 
 from colmap_netvlad.retrieval.options import COMPARED, RetrievalOptions
+from colmap_netvlad.terminal import Command
 from colmap_netvlad.training.evaluate import evaluate, markdown
 from colmap_netvlad.training.scenes import load_dataset
 
 
-@click.command(help=__doc__)
+@click.command(cls=Command, help=__doc__)
 @click.argument("datasets", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option("--databases", required=True, type=click.Path(path_type=Path))
 @click.option("--method", "methods", multiple=True, default=["bow", "vlad"], show_default=True)

@@ -16,15 +16,16 @@ from fit_rounds import read_scene
 
 from colmap_netvlad.cache.ranking import Ranking
 from colmap_netvlad.colmap.database import image_names
-from colmap_netvlad.flight import read_positions
+from colmap_netvlad.flight import open_flight
 from colmap_netvlad.graph.verified import correct_pairs, verified_by_name
 from colmap_netvlad.metrics import mean_average_precision
 from colmap_netvlad.models.catalogue import DEFAULT
+from colmap_netvlad.photos.positions import Positions
 from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval import gps
 from colmap_netvlad.retrieval.fusion import expand, fuse, ranking_of
 from colmap_netvlad.retrieval.options import RetrievalOptions
-from colmap_netvlad.retrieval.rank import rank
+from colmap_netvlad.retrieval.rank import rank_project
 
 DEEP = (0.3, 0.5, 0.7, 1.0, 1.5, 2.0)
 NEIGHBOURS = (5, 8, 12)
@@ -70,21 +71,23 @@ def main() -> None:
 
     best = results[0][1]
     where = [(p, both, t) for p, both, t in zip(projects, rankings, truths, strict=True)]
-    known = [(read_positions(p), fused(both, *best), t) for p, both, t in where]
+    known = [(_positions(p), fused(both, *best), t) for p, both, t in where]
     known = [entry for entry in known if entry[0].useful]
     print(f"\nGPS nearness beside the best of them, {len(known)} flights with GPS:")
     for weight in NEARNESS:
         gps.WEIGHT = weight
-        scores = [
-            100 * mean_average_precision(gps.near_first(r, p, len(r.names) - 1), t)
-            for p, r, t in known
-        ]
+        scores = [100 * mean_average_precision(gps.near_first(r, p), t) for p, r, t in known]
         _row(f"weight {weight}", scores)
 
 
 def _both(project: Project, model: str) -> list[Ranking]:
     options = RetrievalOptions(k=len(image_names(project.database)) - 1, gps="off", rerank=0)
-    return [rank(project, model, options), rank(project, "vlad", options)]
+    return [rank_project(project, model, options), rank_project(project, "vlad", options)]
+
+
+def _positions(project: Project) -> Positions:
+    with open_flight(project) as flight:
+        return flight.positions
 
 
 def _row(name: str, scores: list[float]) -> None:

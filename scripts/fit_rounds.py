@@ -24,9 +24,8 @@ from colmap_netvlad.graph.verified import CORRECT_MATCHES
 from colmap_netvlad.pairs.rounds import FITTED, Weights, find_candidates, replay
 from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval.fusion import similarity_matrix
-from colmap_netvlad.retrieval.methods.hybrid import fusion_depth
 from colmap_netvlad.retrieval.options import RetrievalOptions
-from colmap_netvlad.retrieval.rank import rank
+from colmap_netvlad.retrieval.rank import rank_project
 
 BUDGETS = (2, 4, 6, 10)
 """Pairs for each image."""
@@ -53,8 +52,7 @@ def examples(
     project: Project, method: str, options: RetrievalOptions
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     names = image_names(project.database)
-    depth = min(fusion_depth(20), len(names) - 1)
-    ranking = rank(project, method, replace(options, k=depth))
+    ranking = rank_project(project, method, replace(options, k=20))
     similarity, truth = similarity_matrix(ranking), truth_of(project)
     weights = FITTED[ranking.compared]
     evidence, labels = [], []

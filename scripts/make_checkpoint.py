@@ -32,9 +32,10 @@ from colmap_netvlad.photos.decode import decode_photo
 from colmap_netvlad.photos.files import BadPhoto, find_photos
 from colmap_netvlad.runtime import progress
 from colmap_netvlad.runtime.errors import InputError
+from colmap_netvlad.terminal import Command
 
 
-@click.command(help=__doc__)
+@click.command(cls=Command, help=__doc__)
 @click.argument("folders", nargs=-1, required=True, type=click.Path(path_type=Path, exists=True))
 @click.option("--name", required=True, help="What the checkpoint calls itself.")
 @click.option("--backbone", default="vgg16", type=click.Choice(list(BACKBONES)))

@@ -16,7 +16,8 @@ from pathlib import Path
 
 import click
 
-from colmap_netvlad.compare.result import Comparison, MethodResult, read_json
+from colmap_netvlad.comparison.result import Comparison, MethodResult, read_json
+from colmap_netvlad.terminal import Command
 
 Figure = str
 Published = tuple[Figure, Figure, Figure]
@@ -201,7 +202,7 @@ def _row(label: str, ours: Sequence[Figure], published: Published) -> str:
     return "| " + " | ".join([label, *ours, *published]) + " |"
 
 
-@click.command(help=__doc__)
+@click.command(cls=Command, help=__doc__)
 @click.argument("comparisons", nargs=-1, required=True)
 def main(comparisons: tuple[str, ...]) -> None:
     """Print the tables on standard output."""

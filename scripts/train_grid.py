@@ -18,6 +18,7 @@ import click
 
 from colmap_netvlad.runtime.errors import InputError
 from colmap_netvlad.runtime.files import write_atomically
+from colmap_netvlad.terminal import Command
 from colmap_netvlad.training.options import TrainOptions
 from colmap_netvlad.training.run import TrainReport, train
 from colmap_netvlad.training.scenes import load_dataset
@@ -64,7 +65,7 @@ PAPER = {
 """Accuracy at k = 30 on the paper's three test datasets, % (table 6)."""
 
 
-@click.command(help=__doc__)
+@click.command(cls=Command, help=__doc__)
 @click.argument("datasets", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option("--validation", "held_out", multiple=True, required=True, help="Name of a scene.")
 @click.option("--weights", multiple=True, help="TRUNK=FILE; a trunk without is downloaded.")

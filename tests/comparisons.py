@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from colmap_netvlad.compare.evidence import Evidence, Plan
-from colmap_netvlad.compare.figures import retrieval_figures
-from colmap_netvlad.compare.finds import single_finds
-from colmap_netvlad.compare.result import Comparison, MethodResult, ModelFigures
+from colmap_netvlad.comparison.evidence import Evidence, Plan
+from colmap_netvlad.comparison.figures import retrieval_figures
+from colmap_netvlad.comparison.finds import single_finds
+from colmap_netvlad.comparison.result import Comparison, MethodResult, ModelFigures
 from colmap_netvlad.graph.pair import as_pair
 from colmap_netvlad.graph.verified import correct_pairs
 

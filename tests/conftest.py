@@ -17,7 +17,7 @@ from pathlib import Path
 import pycolmap
 import pytest
 
-from colmap_netvlad.demo.render import Flight, FlightOptions, read_flight, render_flight
+from colmap_netvlad.demo.render import FlightOptions, RenderedFlight, read_flight, render_flight
 from colmap_netvlad.project import Project
 
 FLIGHT = FlightOptions(rows=3, columns=4, width=400, height=300, altitude=45.0)
@@ -50,7 +50,7 @@ def make_once(target: Path, make: Callable[[Path], None]) -> Path:
 
 
 @pytest.fixture(scope="session")
-def flight(shared_folder: Path) -> Flight:
+def flight(shared_folder: Path) -> RenderedFlight:
     """12 photos of 400 x 300 px: 3 lines of 4, every second line flown backwards. Read only."""
     return read_flight(make_once(shared_folder / "flight", lambda to: _render(to)))
 
@@ -60,7 +60,7 @@ def _render(folder: Path) -> None:
 
 
 @pytest.fixture(scope="session")
-def flight_database(flight: Flight, shared_folder: Path) -> Path:
+def flight_database(flight: RenderedFlight, shared_folder: Path) -> Path:
     """A database with the flight's SIFT features and no matches. Read only: do not open it with
     pycolmap; take `project_copy`."""
 
@@ -101,7 +101,7 @@ def matched_database(flight_database: Path, shared_folder: Path) -> Path:
 
 @pytest.fixture
 def project_copy(
-    flight: Flight, flight_database: Path, request: pytest.FixtureRequest, tmp_path: Path
+    flight: RenderedFlight, flight_database: Path, request: pytest.FixtureRequest, tmp_path: Path
 ) -> Callable[..., Project]:
     """A factory of projects of the test's own, to change at will.
 

@@ -29,7 +29,7 @@ def save_jpeg(path: Path, pixels: NDArray[np.uint8], **exif: object) -> None:
         if key in exif:
             tags[tag] = exif[key]
     if "focal" in exif:
-        tags.get_ifd(0x8769)[0xA405] = exif["focal"]
+        tags[0x8769] = {0xA405: exif["focal"]}
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(pixels).save(path, quality=95, exif=tags)
 

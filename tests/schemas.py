@@ -10,6 +10,12 @@ from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 
+import numpy as np
+
+from colmap_netvlad.colmap.database import pair_id
+
+NAMES = ("a/DJI 0001.JPG", "b/DJI 0001.JPG", "Übersicht.jpg", "图.jpg")
+
 VERSIONS = ("3.9", "3.10", "3.11", "3.12", "4.1", "4.2")
 
 _CAMERAS = """CREATE TABLE cameras (camera_id INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL,
@@ -89,3 +95,61 @@ def add_images(path: Path, names: Sequence[str]) -> None:
             "INSERT INTO images (name, camera_id) VALUES (?, 1)", [(name,) for name in names]
         )
         connection.commit()
+
+
+def make_filled(path: Path, version: str) -> None:
+    """Write a database of a COLMAP version with the images `NAMES`."""
+    make_database(path, version)
+    with closing(sqlite3.connect(path)) as connection:
+        _fill(connection)
+        connection.commit()
+
+
+def _fill(connection: sqlite3.Connection) -> None:
+    """Fill in the images `NAMES`: features in three, a verified and a failed pair, priors."""
+    connection.execute("INSERT INTO cameras VALUES (1, 2, 400, 300, NULL, 0)")
+    connection.executemany(
+        "INSERT INTO images (image_id, name, camera_id) VALUES (?, ?, 1)",
+        list(enumerate(NAMES, start=1)),
+    )
+    typed = any(row[1] == "type" for row in connection.execute("PRAGMA table_info(descriptors)"))
+    for image_id in (1, 2, 3):
+        points = np.arange(image_id * 24, dtype=np.float32).reshape(-1, 6)
+        connection.execute(
+            "INSERT INTO keypoints VALUES (?, ?, 6, ?)", (image_id, len(points), points.tobytes())
+        )
+        descriptors = np.full((len(points), 128), image_id, np.uint8)
+        connection.execute(
+            f"INSERT INTO descriptors VALUES (?, {'1,' if typed else ''} ?, 128, ?)",
+            (image_id, len(points), descriptors.tobytes()),
+        )
+    matches = np.array([[0, 1], [2, 3]], np.uint32)
+    for pair, rows in ((pair_id(1, 2), 2), (pair_id(2, 3), 0)):
+        connection.execute("INSERT INTO matches VALUES (?, ?, 2, ?)", (pair, 2, matches.tobytes()))
+        connection.execute(
+            "INSERT INTO two_view_geometries (pair_id, rows, cols, data, config)"
+            " VALUES (?, ?, 2, ?, 2)",
+            (pair, rows, matches[:rows].tobytes()),
+        )
+    _add_priors(connection)
+
+
+def _add_priors(connection: sqlite3.Connection) -> None:
+    columns = {row[1] for row in connection.execute("PRAGMA table_info(pose_priors)")}
+    good, broken = np.array([47.5, 8.25, 400.0]), np.array([np.nan, 8.0, 400.0])
+    if "corr_data_id" in columns:
+        for image_id, position in ((1, good), (2, broken)):
+            connection.execute(
+                "INSERT INTO pose_priors VALUES (?, ?, 1, 0, ?, NULL, NULL, 0)",
+                (image_id, image_id, position.tobytes()),
+            )
+    elif columns:
+        for image_id, position in ((1, good), (2, broken)):
+            connection.execute(
+                "INSERT INTO pose_priors (image_id, position, coordinate_system) VALUES (?, ?, 0)",
+                (image_id, position.tobytes()),
+            )
+    else:
+        connection.execute(
+            "UPDATE images SET prior_tx = 47.5, prior_ty = 8.25, prior_tz = 400 WHERE image_id = 1"
+        )

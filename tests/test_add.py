@@ -12,7 +12,7 @@ import pytest
 from colmap_netvlad.colmap.database import image_names, open_database
 from colmap_netvlad.colmap.features import FeatureOptions, extract_features
 from colmap_netvlad.commands.add import AddOptions, add_photos, newest_model
-from colmap_netvlad.demo.render import Flight
+from colmap_netvlad.demo.render import RenderedFlight
 from colmap_netvlad.mapping.incremental import map_incremental
 from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.matching.run import match_pairs
@@ -25,7 +25,7 @@ NEW = 3
 
 
 @pytest.fixture(scope="module")
-def built(flight: Flight, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def built(flight: RenderedFlight, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A reconstructed workspace of all but the last three photos. Read only."""
     folder = tmp_path_factory.mktemp("built")
     images = folder / "images"
@@ -40,7 +40,9 @@ def built(flight: Flight, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def reconstructed(built: Path, flight: Flight, tmp_path: Path) -> tuple[Project, list[Path]]:
+def reconstructed(
+    built: Path, flight: RenderedFlight, tmp_path: Path
+) -> tuple[Project, list[Path]]:
     """A copy of the workspace, and the three photos it does not have."""
     folder = Path(shutil.copytree(built, tmp_path / "workspace"))
     photos = [flight.images / name for name in flight.names[-NEW:]]

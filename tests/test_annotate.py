@@ -20,8 +20,9 @@ from colmap_netvlad.cli import cli
 from colmap_netvlad.colmap.database import open_database
 from colmap_netvlad.commands import annotate as module
 from colmap_netvlad.commands.annotate import AnnotateOptions, annotate, find_scenes, table_lines
-from colmap_netvlad.demo.render import Flight
+from colmap_netvlad.demo.render import RenderedFlight
 from colmap_netvlad.project import Project
+from colmap_netvlad.retrieval.options import RetrievalOptions
 from colmap_netvlad.runtime.errors import EXIT_PARTIAL, InputError
 from colmap_netvlad.training.scenes import (
     ANNOTATION,
@@ -35,14 +36,14 @@ from colmap_netvlad.training.scenes import (
 
 
 @pytest.fixture(scope="module")
-def dataset(flight: Flight, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def dataset(flight: RenderedFlight, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A dataset of one scene, the rendered flight. Read only."""
     folder = tmp_path_factory.mktemp("dataset")
     _link(flight, folder / "village")
     return folder
 
 
-def _link(flight: Flight, scene: Path) -> None:
+def _link(flight: RenderedFlight, scene: Path) -> None:
     (scene / "images").mkdir(parents=True)
     for name in flight.names:
         os.link(flight.images / name, scene / "images" / name)
@@ -157,7 +158,9 @@ def test_an_annotation_reads_back_as_it_was_written(annotated: Path, tmp_path: P
 
 
 def test_bow_pairs_annotate_a_scene_from_its_photos_alone(dataset: Path, tmp_path: Path) -> None:
-    report = annotate([dataset / "village"], AnnotateOptions(output=tmp_path, k=5))
+    report = annotate(
+        [dataset / "village"], AnnotateOptions(output=tmp_path, retrieval=RetrievalOptions(k=5))
+    )
     assert not report.left_out
     (scene,) = report.scenes
     assert scene.method == "bow" and scene.registered >= 10
@@ -166,7 +169,7 @@ def test_bow_pairs_annotate_a_scene_from_its_photos_alone(dataset: Path, tmp_pat
 
 
 def test_what_is_annotated_is_not_done_again_unless_photos_came(
-    flight: Flight,
+    flight: RenderedFlight,
     annotated: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -213,7 +216,9 @@ def test_a_killed_run_goes_on_with_the_pairs_already_matched(
         return reports[-1]
 
     monkeypatch.setattr(matching, "match_pairs", counted)
-    report = annotate([dataset], AnnotateOptions(output=tmp_path / "out", k=4))
+    report = annotate(
+        [dataset], AnnotateOptions(output=tmp_path / "out", retrieval=RetrievalOptions(k=4))
+    )
     assert not report.left_out and report.scenes[0].registered >= 10
     assert reports[0].matched == 0 and reports[0].already > 0
 
@@ -237,7 +242,7 @@ def test_a_scene_that_does_not_reconstruct_is_named_and_left_out(
 
 
 def test_equal_photos_in_two_scenes_are_found_by_content(
-    flight: Flight, annotated: Path, tmp_path: Path
+    flight: RenderedFlight, annotated: Path, tmp_path: Path
 ) -> None:
     for name in ("one", "two"):
         _link(flight, tmp_path / "data" / name)
@@ -275,7 +280,7 @@ def test_an_annotation_of_another_version_is_refused_and_left_alone(
 
 
 def test_an_annotation_of_other_photos_is_left_alone(
-    flight: Flight, annotated: Path, tmp_path: Path
+    flight: RenderedFlight, annotated: Path, tmp_path: Path
 ) -> None:
     """Two datasets with a scene of one name, annotated into one folder."""
     _link(flight, tmp_path / "other" / "village")

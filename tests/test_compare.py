@@ -15,18 +15,26 @@ from click.testing import CliRunner
 
 from colmap_netvlad.cli import cli
 from colmap_netvlad.commands import compare as pipeline
-from colmap_netvlad.commands.compare import CompareOptions, compare
-from colmap_netvlad.compare import models, pool
-from colmap_netvlad.compare.result import Comparison, read_json, write_json
-from colmap_netvlad.compare.workspace import file_name, open_workspace, read_facts
+from colmap_netvlad.commands.compare import CompareOptions
+from colmap_netvlad.comparison import models, pool
+from colmap_netvlad.comparison.result import Comparison, read_json, write_json
+from colmap_netvlad.comparison.workspace import Workspace, file_name, open_workspace
+from colmap_netvlad.flight import open_flight
 from colmap_netvlad.graph.verified import correct_pairs, verified_by_name
 from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.project import Project
 from colmap_netvlad.runtime.errors import EXIT_PARTIAL, InputError
 
+
+def compare(*arguments, **options) -> tuple[Comparison, Workspace]:
+    """Compare, and return the figures and the comparison's folder."""
+    report = pipeline.compare(*arguments, **options)
+    return report.comparison, Workspace(report.page.parent)
+
+
 METHODS = ("vlad", "random")
 # One thread: COLMAP adds in the order its threads finish, so only that repeats the last digits.
-OPTIONS = CompareOptions(ks=(2, 4), mapping=MappingOptions(threads=1))
+OPTIONS = CompareOptions(k=(2, 4), mapping=MappingOptions(threads=1))
 FAST = replace(OPTIONS, reconstruct=False)
 
 Make = Callable[..., Project]
@@ -287,7 +295,7 @@ def test_a_long_exhaustive_matching_is_asked_about(no_page, project_copy: Make, 
     project = project_copy()
     monkeypatch.setattr(pipeline, "ASK_ABOVE", 0.0)
     asked = []
-    with pytest.raises(InputError, match=r"about .* min .*--yes"):
+    with pytest.raises(InputError, match=r"about .* min .*`confirm`"):
         compare(project, ["exhaustive"], FAST, lambda question: bool(asked.append(question)))
     assert "42 pairs" in asked[0] or "66 pairs" in asked[0]
     comparison, _ = compare(project, ["exhaustive"], FAST, lambda question: True)
@@ -296,9 +304,9 @@ def test_a_long_exhaustive_matching_is_asked_about(no_page, project_copy: Make, 
 
 def test_pairs_of_the_cost_sample_are_not_in_the_union(no_page, unbroken, project_copy: Make):
     project = project_copy(name="sampled")
-    facts = read_facts(project.database)
-    workspace = open_workspace(project.folder / "project-compare", project.database, facts)
-    pool.measure_cost(workspace, facts.names, FAST.matching)
+    with open_flight(project) as flight:
+        workspace = open_workspace(project.folder / "project-compare", flight)
+        pool.measure_cost(workspace, flight.names, FAST.matching)
     assert timeless(compare(project, METHODS, FAST)[0]) == unbroken
 
 
@@ -343,7 +351,7 @@ def test_a_database_without_features_is_refused(project_copy: Make):
     with closing(sqlite3.connect(project.database)) as connection, connection:
         connection.execute("DELETE FROM keypoints")
         connection.execute("DELETE FROM descriptors")
-    with pytest.raises(InputError, match="no local features"):
+    with pytest.raises(InputError, match="no features"):
         compare(project, ["random"], FAST)
 
 

@@ -7,14 +7,12 @@ import sqlite3
 from contextlib import closing
 from pathlib import Path
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from schemas import VERSIONS, make_database
+from schemas import NAMES, VERSIONS, make_filled
 
 from colmap_netvlad.colmap.database import (
-    copy_database,
     image_names,
     images_of_pair,
     open_database,
@@ -23,67 +21,12 @@ from colmap_netvlad.colmap.database import (
 from colmap_netvlad.photos.positions import CoordinateSystem
 from colmap_netvlad.runtime.errors import InputError
 
-NAMES = ("a/DJI 0001.JPG", "b/DJI 0001.JPG", "Übersicht.jpg", "图.jpg")
-
 
 @pytest.fixture(params=VERSIONS)
 def database(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
-    """A database of four images: features in three, one verified and one failed pair, priors."""
     path = tmp_path / "project.db"
-    make_database(path, request.param)
-    with closing(sqlite3.connect(path)) as connection:
-        _fill(connection)
-        connection.commit()
+    make_filled(path, request.param)
     return path
-
-
-def _fill(connection: sqlite3.Connection) -> None:
-    connection.execute("INSERT INTO cameras VALUES (1, 2, 400, 300, NULL, 0)")
-    connection.executemany(
-        "INSERT INTO images (image_id, name, camera_id) VALUES (?, ?, 1)",
-        list(enumerate(NAMES, start=1)),
-    )
-    typed = any(row[1] == "type" for row in connection.execute("PRAGMA table_info(descriptors)"))
-    for image_id in (1, 2, 3):
-        points = np.arange(image_id * 24, dtype=np.float32).reshape(-1, 6)
-        connection.execute(
-            "INSERT INTO keypoints VALUES (?, ?, 6, ?)", (image_id, len(points), points.tobytes())
-        )
-        descriptors = np.full((len(points), 128), image_id, np.uint8)
-        connection.execute(
-            f"INSERT INTO descriptors VALUES (?, {'1,' if typed else ''} ?, 128, ?)",
-            (image_id, len(points), descriptors.tobytes()),
-        )
-    matches = np.array([[0, 1], [2, 3]], np.uint32)
-    for pair, rows in ((pair_id(1, 2), 2), (pair_id(2, 3), 0)):
-        connection.execute("INSERT INTO matches VALUES (?, ?, 2, ?)", (pair, 2, matches.tobytes()))
-        connection.execute(
-            "INSERT INTO two_view_geometries (pair_id, rows, cols, data, config)"
-            " VALUES (?, ?, 2, ?, 2)",
-            (pair, rows, matches[:rows].tobytes()),
-        )
-    _add_priors(connection)
-
-
-def _add_priors(connection: sqlite3.Connection) -> None:
-    columns = {row[1] for row in connection.execute("PRAGMA table_info(pose_priors)")}
-    good, broken = np.array([47.5, 8.25, 400.0]), np.array([np.nan, 8.0, 400.0])
-    if "corr_data_id" in columns:
-        for image_id, position in ((1, good), (2, broken)):
-            connection.execute(
-                "INSERT INTO pose_priors VALUES (?, ?, 1, 0, ?, NULL, NULL, 0)",
-                (image_id, image_id, position.tobytes()),
-            )
-    elif columns:
-        for image_id, position in ((1, good), (2, broken)):
-            connection.execute(
-                "INSERT INTO pose_priors (image_id, position, coordinate_system) VALUES (?, ?, 0)",
-                (image_id, position.tobytes()),
-            )
-    else:
-        connection.execute(
-            "UPDATE images SET prior_tx = 47.5, prior_ty = 8.25, prior_tz = 400 WHERE image_id = 1"
-        )
 
 
 def _sha256(path: Path) -> str:
@@ -120,17 +63,6 @@ def test_position_priors_are_read_from_every_version_and_broken_ones_left_out(
     assert list(priors) == [1]
     assert priors[1].position == (47.5, 8.25, 400.0)
     assert priors[1].coordinate_system in (CoordinateSystem.WGS84, CoordinateSystem.CARTESIAN)
-
-
-def test_a_feature_copy_has_no_matches_and_leaves_its_source(database: Path) -> None:
-    before = _sha256(database)
-    target = database.with_name("copy.db")
-    copy_database(database, target, matches=False)
-    assert _sha256(database) == before
-    assert image_names(target) == NAMES
-    with open_database(target) as copy:
-        assert copy.descriptor_counts() == {1: 4, 2: 8, 3: 12}
-        assert copy.matched_pairs() == set()
 
 
 def test_reading_a_wal_database_at_rest_leaves_no_files_beside_it(database: Path) -> None:

@@ -16,10 +16,12 @@ from colmap_netvlad.cli import cli
 from colmap_netvlad.colmap.database import open_database
 from colmap_netvlad.commands.demo import run_demo
 from colmap_netvlad.demo.check import align, check_against_truth
-from colmap_netvlad.demo.render import Flight, FlightOptions, render_flight, to_wgs84
+from colmap_netvlad.demo.render import FlightOptions, RenderedFlight, render_flight, to_wgs84
 
 
-def test_flight_reconstructs_whole_and_within_one_percent(flight: Flight, project_copy, tmp_path):
+def test_flight_reconstructs_whole_and_within_one_percent(
+    flight: RenderedFlight, project_copy, tmp_path
+):
     project = project_copy(matched=True)
     pycolmap.set_random_seed(0)
     models = pycolmap.incremental_mapping(project.database, project.images, tmp_path)
@@ -34,7 +36,7 @@ def test_flight_reconstructs_whole_and_within_one_percent(flight: Flight, projec
     assert error.max() < 0.01 * flight.extent
 
 
-def test_photos_carry_focal_length_and_true_position(flight: Flight, project_copy):
+def test_photos_carry_focal_length_and_true_position(flight: RenderedFlight, project_copy):
     project = project_copy()
     with open_database(project.database) as database:
         priors = database.pose_priors()
@@ -76,7 +78,9 @@ def test_blocks_are_separate_flights(tmp_path: Path):
     assert np.linalg.norm(made.centres[0] - made.centres[2]) > 500
 
 
-def test_legacy_database_has_the_schema_of_colmap_3_9(legacy_database: Path, flight: Flight):
+def test_legacy_database_has_the_schema_of_colmap_3_9(
+    legacy_database: Path, flight: RenderedFlight
+):
     with closing(sqlite3.connect(legacy_database)) as connection:
         assert connection.execute("PRAGMA user_version").fetchone() == (3900,)
         tables = {r[0] for r in connection.execute("SELECT name FROM sqlite_master")}
@@ -86,7 +90,7 @@ def test_legacy_database_has_the_schema_of_colmap_3_9(legacy_database: Path, fli
         assert min(database.keypoint_counts().values()) > 100
 
 
-def test_check_is_blind_to_frame_and_scale_but_not_to_a_moved_camera(flight: Flight):
+def test_check_is_blind_to_frame_and_scale_but_not_to_a_moved_camera(flight: RenderedFlight):
     true = dict(zip(flight.names, flight.centres, strict=True))
     turn = flight.rotations[0]
     found = {name: 0.1 * turn @ centre + 5 for name, centre in true.items()}
@@ -97,7 +101,7 @@ def test_check_is_blind_to_frame_and_scale_but_not_to_a_moved_camera(flight: Fli
     assert np.linalg.norm(moved - target, axis=1).max() > 0.03 * flight.extent
 
 
-def test_check_fails_without_a_model(flight: Flight):
+def test_check_fails_without_a_model(flight: RenderedFlight):
     check = check_against_truth([], flight)
     assert not check.passed
     assert check.registered == 0

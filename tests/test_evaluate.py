@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from colmap_netvlad.commands.annotate import AnnotateOptions, annotate
-from colmap_netvlad.demo.render import Flight
+from colmap_netvlad.demo.render import RenderedFlight
 from colmap_netvlad.runtime.errors import InputError
 from colmap_netvlad.training.evaluate import evaluate, markdown
 from colmap_netvlad.training.scenes import Scene
@@ -18,7 +18,7 @@ from colmap_netvlad.training.scenes import Scene
 
 @pytest.fixture
 def scene_and_databases(
-    flight: Flight, matched_database: Path, tmp_path: Path
+    flight: RenderedFlight, matched_database: Path, tmp_path: Path
 ) -> tuple[Scene, Path]:
     databases = tmp_path / "databases"
     databases.mkdir()

@@ -16,7 +16,8 @@ from colmap_netvlad.colmap import engine
 from colmap_netvlad.colmap import features as features_module
 from colmap_netvlad.colmap.database import ImageRow, open_database
 from colmap_netvlad.colmap.features import FeatureOptions, FeatureReport, extract_features
-from colmap_netvlad.project import find_project
+from colmap_netvlad.demo.render import RenderedFlight
+from colmap_netvlad.project import open_project
 from colmap_netvlad.runtime.errors import EXIT_PARTIAL, InputError
 
 FEW = {"max_features": 200, "threads": 1}
@@ -56,7 +57,7 @@ def test_sound_photos_of_every_kind_are_imported_and_broken_ones_listed(tmp_path
         assert f"Left out: {name} " in result.stderr
     assert f"{len(SOUND)} extracted now" in result.stdout
     assert "colmap-netvlad pairs --db" in result.stdout
-    assert find_project(tmp_path / "project.db").images == images
+    assert open_project(tmp_path / "project.db").images == images
 
 
 def test_a_second_run_extracts_nothing_and_new_photos_share_the_camera(images: Path) -> None:
@@ -129,7 +130,7 @@ def test_a_stopped_run_goes_on_with_the_next_photo(
     monkeypatch.setattr(engine, "call", stop_at_the_second)
     with pytest.raises(KeyboardInterrupt):
         extract(images)
-    assert set(rows(images)) == {"0.jpg"}
+    assert set(rows(images)) == {"0.jpg", "1.jpg"}, "the second is imported, not extracted"
     report = extract(images)
     assert (report.already, report.extracted, report.cameras) == (1, 2, 1)
     assert calls == [["0.jpg"], ["1.jpg"], ["1.jpg"], ["2.jpg"]]
@@ -190,8 +191,8 @@ def test_a_photo_without_texture_is_listed_and_stays(images: Path) -> None:
 
 def test_gps_of_photos_reaches_the_database(images: Path) -> None:
     exif = Image.Exif()
-    gps = exif.get_ifd(0x8825)
-    gps.update({1: "N", 2: (47.0, 30.0, 0.0), 3: "E", 4: (8.0, 15.0, 0.0), 5: b"\0", 6: 420.0})
+    place = {1: "N", 2: (47.0, 30.0, 0.0), 3: "E", 4: (8.0, 15.0, 0.0), 5: b"\0", 6: 420.0}
+    exif[0x8825] = place
     Image.fromarray(scene(7)).save(images / "gps.jpg", exif=exif)
     extract(images)
     with open_database(images.parent / "project.db") as database:
@@ -203,11 +204,11 @@ def test_gps_of_photos_reaches_the_database(images: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        ({"camera": "stereo"}, "--camera is stereo; choose auto"),
+        ({"camera": "stereo"}, "`camera` is stereo; choose auto"),
         ({"camera_model": "LENS"}, "no camera model LENS"),
-        ({"max_image_size": 0}, "--max-image-size is 0"),
-        ({"max_features": -1}, "--max-features is -1"),
-        ({"threads": 0}, "--threads is 0"),
+        ({"max_image_size": 0}, "`max_image_size` is 0"),
+        ({"max_features": -1}, "`max_features` is -1"),
+        ({"threads": 0}, "`threads` is 0"),
         ({"masks": Path("nowhere")}, "mask folder nowhere does not exist"),
     ],
 )
@@ -226,3 +227,14 @@ def test_a_folder_without_photos_is_said(tmp_path: Path) -> None:
     (tmp_path / "images" / "notes.txt").write_text("no photo")
     with pytest.raises(InputError, match="There are no photos in"):
         extract(tmp_path / "images")
+
+
+def test_ids_follow_the_names_whatever_the_threads(flight: RenderedFlight, tmp_path: Path) -> None:
+    for name, threads in (("one.db", 1), ("three.db", 3)):
+        options = FeatureOptions(max_features=300, threads=threads)
+        extract_features(flight.images, tmp_path / name, options)
+    with open_database(tmp_path / "one.db") as one, open_database(tmp_path / "three.db") as three:
+        assert [image.name for image in one.images()] == sorted(flight.names)
+        assert one.images() == three.images()
+        assert one.keypoint_counts() == three.keypoint_counts()
+        assert one.feature_fingerprints() == three.feature_fingerprints()

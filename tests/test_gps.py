@@ -61,13 +61,13 @@ def test_near_first_keeps_those_left_out_without_partners() -> None:
         "deep",
         left_out=(("d", "is empty"),),
     )
-    nearer = near_first(ranking, on_a_line(0, 1, 900, 2), 1)
+    nearer = near_first(ranking, on_a_line(0, 1, 900, 2)).top(1)
     assert nearer.partners[3].tolist() == [NO_PARTNER]
     assert 3 not in nearer.partners[:3]
     assert "positions of 3 of 4 photos used" in nearer.notes
 
 
-def test_useless_positions_only_cut_the_ranking() -> None:
+def test_useless_positions_leave_the_ranking_as_it_is() -> None:
     ranking = from_lists(("a", "b", "c"), [[(2, 2.0), (1, 1.0)], [(0, 1.0)], [(0, 1.0)]], "deep")
-    nearer = near_first(ranking, on_a_line(np.nan, np.nan, np.nan), 1)
-    assert nearer.partners.tolist() == [[2], [0], [0]]
+    nearer = near_first(ranking, on_a_line(np.nan, np.nan, np.nan))
+    assert nearer.partners.tolist() == ranking.partners.tolist()

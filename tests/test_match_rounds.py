@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from ranks import rank
 
 from colmap_netvlad.cache.ranking import Ranking
 from colmap_netvlad.colmap.database import image_names, open_database
@@ -18,7 +19,6 @@ from colmap_netvlad.matching import rounds as match_rounds
 from colmap_netvlad.matching.rounds import match_in_rounds, plan_budget
 from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval.options import RetrievalOptions
-from colmap_netvlad.retrieval.rank import rank
 from colmap_netvlad.runtime.errors import InputError
 
 
@@ -113,7 +113,7 @@ def test_a_ranking_of_other_images_is_one_sentence(
 
 
 @pytest.mark.parametrize(
-    ("budget", "rounds", "said"), [(5, 3, "at least 6"), (18, 0, "--rounds is 0")]
+    ("budget", "rounds", "said"), [(5, 3, "at least 6"), (18, 0, "`rounds` is 0")]
 )
 def test_too_small_a_budget_is_one_sentence_and_matches_nothing(
     flight_ranking: tuple[Project, Ranking], budget: int, rounds: int, said: str

@@ -16,6 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from colmap_netvlad.colmap import engine
+from colmap_netvlad.colmap.copies import copy_matches
 from colmap_netvlad.colmap.database import image_names, open_database, pair_id
 from colmap_netvlad.matching import run as matching
 from colmap_netvlad.matching.run import MatchOptions, match_pairs
@@ -129,7 +130,7 @@ def test_a_process_waits_while_another_writes(project_copy: MakeProject) -> None
     thread = threading.Thread(target=write_slowly)
     thread.start()
     ready.wait()
-    matching._copy_matches(database, target, [two])
+    copy_matches(database, target, [two])
     thread.join()
     assert results(target)[two] == results(database)[two]
 
@@ -142,9 +143,9 @@ def test_a_failing_process_is_said_and_leaves_what_is_matched(
     monkeypatch.setattr(matching, "BLOCK", 5)
     run = workers.run
 
-    def without_the_second_folder(jobs: list[workers.Job], *others: Any) -> Any:
+    def without_the_second_folder(jobs: list[workers.Job], *others: Any, **options: Any) -> Any:
         jobs[1].arguments[1].rmdir()
-        return run(jobs, *others)
+        return run(jobs, *others, **options)
 
     monkeypatch.setattr(workers, "run", without_the_second_folder)
     with pytest.raises(InputError, match="run the command again"):

@@ -308,7 +308,7 @@ def test_weights_not_shipped_say_where_to_get_and_where_to_put_them(tmp_path, mo
         load_model("netvlad")
     assert "Pitts30K_struct.mat" in fault.value.message
     assert str(tmp_path / "hub" / "checkpoints") in fault.value.message
-    assert "--model" in fault.value.message
+    assert "`model`" in fault.value.message
 
 
 @pytest.mark.parametrize("variable", ["TORCH_HOME", "XDG_CACHE_HOME", None])
@@ -323,11 +323,11 @@ def test_the_cache_is_torch_hubs(variable, tmp_path, monkeypatch):
 def test_local_features_turn_with_the_photo(checkpoint, photos):
     edit(checkpoint, lambda card: card.update(rotations=4))
     model = load_model(checkpoint, "cpu")
-    descriptors, upright = model.describe_with_local(photos)
+    descriptors, upright = model.describe_with_cells(photos)
     np.testing.assert_array_equal(descriptors, model.describe(photos))
     assert np.allclose(np.linalg.norm(upright, axis=1), 1, atol=1e-5)
     for turns in (1, 2, 3):
-        _, turned = model.describe_with_local(np.rot90(photos, turns, axes=(2, 3)))
+        _, turned = model.describe_with_cells(np.rot90(photos, turns, axes=(2, 3)))
         expected = np.rot90(upright, turns, axes=(2, 3))
         np.testing.assert_allclose(turned, expected, atol=1e-3)
 
@@ -336,7 +336,7 @@ def test_places_without_texture_have_no_local_feature(checkpoint, photos):
     model = load_model(checkpoint, "cpu")
     masked = photos.copy()
     masked[:, :, :, : photos.shape[3] // 2] = 77
-    _, local = model.describe_with_local(masked)
+    _, local = model.describe_with_cells(masked)
     length = np.linalg.norm(local, axis=1)
     width = local.shape[3]
     assert (length[:, :, : width // 2] == 0).all()

@@ -23,13 +23,13 @@ from hypothesis import strategies as st
 from schemas import VERSIONS, add_images, make_database
 
 from colmap_netvlad.cache.ranking import NO_PARTNER, Ranking
-from colmap_netvlad.cache.store import Store
 from colmap_netvlad.cli import cli
 from colmap_netvlad.colmap.database import image_names
 from colmap_netvlad.commands.pairs import make_pairs
 from colmap_netvlad.pairs.union import union_of_top
-from colmap_netvlad.project import Project, find_project
+from colmap_netvlad.project import Project, open_project
 from colmap_netvlad.retrieval.options import RetrievalOptions
+from colmap_netvlad.retrieval.rank import rank_project
 from colmap_netvlad.runtime.errors import EXIT_PARTIAL
 
 MakeProject = Callable[..., Project]
@@ -150,7 +150,7 @@ def test_a_workspace_moved_as_a_whole_still_finds_its_photos(
     project.images.rename(inside)
     assert run("--db", project.database, "--images", inside, "--method", "random").exit_code == 0
     project.folder.rename(tmp_path / "moved")
-    found = find_project(tmp_path / "moved" / "project.db")
+    found = open_project(tmp_path / "moved" / "project.db")
     assert found.images is not None
     assert found.images.resolve() == (tmp_path / "moved" / "DCIM").resolve()
 
@@ -215,10 +215,8 @@ def test_json_holds_scores_and_ranks(project_copy: MakeProject, tmp_path: Path) 
     assert result.exit_code == 0, result.output
     rows = json.loads(output.read_text())
     assert all(1 <= row["rank"] <= 3 and -1 <= row["score"] <= 1.001 for row in rows)
-    with Store(project.cache) as store:
-        kept = store.load_ranking("vlad", image_names(project.database))
-    assert kept is not None
-    assert len(union_of_top(kept, 3)) == len(rows)
+    ranking = rank_project(project, "vlad", RetrievalOptions(k=3))
+    assert len(union_of_top(ranking, 3)) == len(rows)
 
 
 @pytest.fixture

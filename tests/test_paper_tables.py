@@ -11,7 +11,7 @@ import pytest
 from click.testing import CliRunner
 from comparisons import made_up
 
-from colmap_netvlad.compare.result import write_json
+from colmap_netvlad.comparison.result import write_json
 
 
 @pytest.fixture(scope="module")

@@ -15,6 +15,7 @@ import numpy as np
 import pycolmap
 import pytest
 
+from colmap_netvlad.colmap.copies import copy_images
 from colmap_netvlad.colmap.database import images_of_pair
 from colmap_netvlad.demo.simulate import SimulationOptions, simulate_flight
 from colmap_netvlad.graph.viewgraph import read_view_graph
@@ -22,7 +23,6 @@ from colmap_netvlad.mapping import MAPPERS, parallel
 from colmap_netvlad.mapping.incremental import map_incremental
 from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.mapping.partition import Cluster, partition
-from colmap_netvlad.mapping.subset import write_subset
 from colmap_netvlad.runtime.errors import InputError
 
 FLIGHT = SimulationOptions(lines=4, photos=8, features=150, partners=12)
@@ -99,7 +99,7 @@ def test_a_cluster_database_has_the_same_ids_and_only_its_own_images(
 ) -> None:
     before = mapped.database.read_bytes()
     names = mapped.clusters[0].images
-    write_subset(mapped.database, tmp_path / "subset.db", names)
+    copy_images(mapped.database, tmp_path / "subset.db", names)
     assert mapped.database.read_bytes() == before
     with closing(sqlite3.connect(tmp_path / "subset.db")) as subset:
         ids = dict(subset.execute("SELECT name, image_id FROM images"))

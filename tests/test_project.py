@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from colmap_netvlad.cache.store import Store
 from colmap_netvlad.project import open_project
 from colmap_netvlad.runtime.errors import InputError
 
@@ -28,23 +29,25 @@ def test_the_remembered_photo_folder_comes_before_images_beside_the_database(
     (tmp_path / "images").mkdir()
     remembered = tmp_path / "elsewhere"
     remembered.mkdir()
-    assert open_project(tmp_path / "project.db", remembered=remembered).images == remembered
+    with Store(tmp_path / "project.netvlad.db") as store:
+        store.remember_images(remembered)
+    assert open_project(tmp_path / "project.db").images == remembered
     remembered.rmdir()
-    project = open_project(tmp_path / "project.db", remembered=remembered)
+    project = open_project(tmp_path / "project.db")
     assert project.images == tmp_path / "images"
 
 
 def test_without_photos_a_project_opens_and_says_so_when_they_are_needed(tmp_path: Path) -> None:
     (tmp_path / "project.db").touch()
     project = open_project(tmp_path / "project.db")
-    with pytest.raises(InputError, match="--images"):
+    with pytest.raises(InputError, match="`images`"):
         project.need_images()
 
 
 @pytest.mark.parametrize(
     ("database", "images", "message"),
     [
-        (None, None, "name the database with --db"),
+        (None, None, "name one with `database`"),
         ("absent.db", None, r"absent\.db does not exist"),
         (".", None, "is a folder"),
         ("there.db", "nowhere", "photo folder .*nowhere does not exist"),

@@ -18,13 +18,11 @@ from click.testing import CliRunner
 from colmap_netvlad.cli import cli
 from colmap_netvlad.colmap import engine
 from colmap_netvlad.colmap.database import image_names
+from colmap_netvlad.commands.match import MatchingReport, working_copy
 from colmap_netvlad.commands.reconstruct import (
     ReconstructReport,
-    map_and_report,
     reconstruct,
     report_lines,
-    report_table,
-    working_copy,
 )
 from colmap_netvlad.mapping.incremental import map_incremental
 from colmap_netvlad.mapping.output import free_output
@@ -32,15 +30,21 @@ from colmap_netvlad.mapping.summary import ModelSummary, combine, registered_nam
 from colmap_netvlad.matching.run import MatchReport
 from colmap_netvlad.project import Project
 from colmap_netvlad.runtime.errors import InputError
+from colmap_netvlad.terminal import models_table
 
 MakeProject = Callable[..., Project]
-MATCHED = MatchReport(requested=66, already=66, matched=0, verified=50, seconds=0.0)
 
 
 def write_all_pairs(project: Project) -> None:
     names = image_names(project.database)
     lines = (f"{a} {b}\n" for i, a in enumerate(names) for b in names[i + 1 :])
     project.pairs.write_text("".join(lines), encoding="utf-8")
+
+
+def map_matched(project: Project) -> ReconstructReport:
+    """Reconstruct from pairs that are matched already."""
+    write_all_pairs(project)
+    return reconstruct(project)
 
 
 def poses(model: pycolmap.Reconstruction) -> dict[str, np.ndarray]:
@@ -66,9 +70,9 @@ def test_reconstruct_writes_the_model_and_prints_its_figures(project_copy: MakeP
 
 def test_two_runs_give_the_same_model_and_the_first_one_stays(project_copy: MakeProject) -> None:
     project = project_copy(matched=True)
-    first = map_and_report(project, MATCHED)
+    first = map_matched(project)
     files = {path: path.read_bytes() for path in project.sparse.rglob("*") if path.is_file()}
-    second = map_and_report(project, MATCHED)
+    second = map_matched(project)
     assert second.output == project.folder / "sparse-2"
     assert {path: path.read_bytes() for path in files} == files
     assert (first.models, first.missing) == (second.models, second.missing)
@@ -122,9 +126,10 @@ def test_an_interrupted_mapping_leaves_no_trace(
 
     call = engine.call
     monkeypatch.setattr(engine, "call", stop)
+    write_all_pairs(project)
     before = {path.name for path in project.folder.iterdir()}
     with pytest.raises(KeyboardInterrupt):
-        map_and_report(project, MATCHED)
+        map_matched(project)
     after = {path.name for path in project.folder.iterdir()}
     assert {name for name in after - before if not name.endswith(("-wal", "-shm"))} == set()
 
@@ -201,11 +206,19 @@ def test_summaries_count_an_image_of_two_models_once(project_copy: MakeProject) 
 
 def test_the_report_shows_each_component_and_the_total(tmp_path: Path) -> None:
     model = ModelSummary(5, 1000, 0.5, 3.0, 3000)
+    matched = MatchReport(requested=66, already=66, matched=0, verified=50, seconds=0.0)
     report = ReconstructReport(
-        tmp_path, 20, MATCHED, [model], model, [f"{i}.jpg" for i in range(15)], {"matching": 90.0}
+        tmp_path,
+        20,
+        MatchingReport(matched, []),
+        [model],
+        model,
+        [f"{i}.jpg" for i in range(15)],
+        {"matching": 90.0},
     )
-    assert report_table(report).row_count == 1
-    assert report_table(replace(report, models=[model, model])).row_count == 3
+    assert models_table(report).row_count == 1
+    assert models_table(replace(report, models=[model, model])).row_count == 3
     text = "\n".join(report_lines(report))
-    assert "15 of 20 images: 0.jpg" in text and "9.jpg, ..." in text and "10.jpg" not in text
+    assert "15 of 20 images: 0.jpg" in text and "9.jpg, and 5 more." in text
+    assert "10.jpg" not in text
     assert "matching 1.5" in text

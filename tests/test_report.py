@@ -15,16 +15,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
 
-from colmap_netvlad.compare.evidence import Plan
-from colmap_netvlad.compare.figures import retrieval_figures
-from colmap_netvlad.compare.finds import single_finds
-from colmap_netvlad.compare.result import MethodResult, ModelFigures, RetrievalFigures
+from colmap_netvlad.comparison.evidence import Plan
+from colmap_netvlad.comparison.figures import retrieval_figures
+from colmap_netvlad.comparison.finds import single_finds
+from colmap_netvlad.comparison.result import MethodResult, ModelFigures, RetrievalFigures
 from colmap_netvlad.graph.pair import as_pair
-from colmap_netvlad.report.comparison import print_comparison, write_csv
+from colmap_netvlad.report.comparison import write_csv
 from colmap_netvlad.report.examples import choose_examples, hardest_images
 from colmap_netvlad.report.layout import align, from_above, lay_out, similarity
 from colmap_netvlad.report.measures import MEASURES, seconds
 from colmap_netvlad.report.page import render_page
+from colmap_netvlad.terminal import print_comparison
 
 
 @pytest.fixture(scope="module")

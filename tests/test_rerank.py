@@ -10,14 +10,14 @@ from click.testing import CliRunner
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from ranks import rank
 
-from colmap_netvlad.cache.cells import LocalFeatures
+from colmap_netvlad.cache.cells import Cells
 from colmap_netvlad.cache.ranking import NO_PARTNER, Ranking
 from colmap_netvlad.cache.store import Store
 from colmap_netvlad.cli import cli
 from colmap_netvlad.retrieval import rerank as module
 from colmap_netvlad.retrieval.options import COMPARED, RetrievalOptions
-from colmap_netvlad.retrieval.rank import rank
 from colmap_netvlad.retrieval.rerank import CHANCE, Places, agreeing_matches, rerank
 
 SIDE, STEP, PHOTOS = 12, 4, 9
@@ -30,13 +30,13 @@ def ground(seed: int = 0) -> NDArray[np.float32]:
     return rng.normal(size=(32, SIDE, SIDE + STEP * (PHOTOS - 1))).astype(np.float32)
 
 
-def photo(number: int, turns: int = 0, seed: int = 0) -> LocalFeatures:
+def photo(number: int, turns: int = 0, seed: int = 0) -> Cells:
     """The features of a photo of the strip, the camera turned by quarter turns."""
     cut = ground(seed)[:, :, STEP * number : STEP * number + SIDE]
-    return LocalFeatures.of(np.rot90(cut, turns, axes=(1, 2)))
+    return Cells.of(np.rot90(cut, turns, axes=(1, 2)))
 
 
-def agreeing(one: LocalFeatures, other: LocalFeatures) -> int:
+def agreeing(one: Cells, other: Cells) -> int:
     return agreeing_matches(Places.of(one), Places.of(other))
 
 
@@ -69,7 +69,7 @@ def by_chance(seed: int = 1, photos: int = PHOTOS) -> Ranking:
 @settings(max_examples=30, deadline=None)
 def test_features_come_back_with_their_directions(seed: int, h: int, w: int, unit: float) -> None:
     features = np.random.default_rng(seed).normal(size=(64, h, w)) * unit
-    kept = LocalFeatures.of(features)
+    kept = Cells.of(features)
     assert kept.codes.shape == (h, w, 64)
     flat = features.reshape(64, -1).T
     cosines = (kept.vectors() * flat).sum(axis=1) / np.linalg.norm(flat, axis=1)
@@ -102,8 +102,8 @@ def test_the_count_is_the_same_both_ways_and_every_time() -> None:
 def test_places_without_texture_do_not_agree() -> None:
     mask = np.zeros((32, SIDE, SIDE), np.float32)
     mask[:, 0, 0] = mask[:, 5, 7] = 1
-    assert agreeing(LocalFeatures.of(np.zeros_like(mask)), photo(0)) == 0
-    assert agreeing(LocalFeatures.of(mask), LocalFeatures.of(mask)) <= 2
+    assert agreeing(Cells.of(np.zeros_like(mask)), photo(0)) == 0
+    assert agreeing(Cells.of(mask), Cells.of(mask)) <= 2
 
 
 def test_neighbours_on_the_ground_come_first_whatever_order_they_were_found_in(
@@ -146,7 +146,7 @@ def test_a_neighbour_whom_the_descriptors_overlooked_is_found_by_way_of_its_neig
     )
     partners[0] = [1, 8, 7, 6, 5, 4, 3, 2]
     found = Ranking(candidates.names, partners, candidates.scores, "chance")
-    assert set(rerank(found, store, "m", 2, depth=2).partners[0]) == {1, 2}
+    assert set(rerank(found, store, "m", 2, depth=2).partners[0, :2]) == {1, 2}
 
 
 def test_what_was_compared_is_not_compared_again(store: Store, monkeypatch) -> None:
@@ -211,13 +211,31 @@ def test_a_cache_of_before_gets_its_tables(tmp_path: Path) -> None:
     path = tmp_path / "project.netvlad.db"
     with Store(path) as store:
         store.add_descriptors("m", ["a"], ["1"], np.ones((1, 4), np.float32) / 2, 0)
-        store._db.execute("DROP TABLE agreements")
-        store._db.execute("DROP TABLE local_features")
-    with Store(path) as store:
-        assert store.described("m") == {"a": "1"}
-        assert store.described_locally("m") == {}
         keep(store, [0])
-        assert store.described_locally("m") == {"0.jpg": "0.jpg"}
+        store._db.execute("ALTER TABLE cells RENAME TO local_features")
+        store._db.execute("DROP TABLE photos")
+        store._db.execute("CREATE TABLE rankings (method TEXT)")
+        store._db.execute("PRAGMA user_version = 1")
+    with Store(path) as store:
+        assert store.described("m").keys() == {"a", "0.jpg"}
+        assert store.described_in_cells("m") == {"0.jpg": "0.jpg"}, "they are kept"
+        assert store.photos() == {}
+        assert "rankings" not in store._db.table_names()
+
+
+def test_what_was_counted_for_a_photo_that_changed_is_pruned(tmp_path: Path) -> None:
+    path = tmp_path / "project.netvlad.db"
+    with Store(path) as store:
+        keep(store, range(PHOTOS))
+        rerank(by_chance(), store, "m", 5)
+        before = len(store.agreements()[0])
+        keep(store, [3], seed=9, content="changed")
+        gone = set(store.agreements()[0].ravel().tolist()) - set(store.cell_numbers("m").values())
+        assert gone, "the old photo's counts are still there"
+    with Store(path) as store:
+        pairs = store.agreements()[0]
+        assert not gone & set(pairs.ravel().tolist())
+        assert 0 < len(pairs) < before
 
 
 def test_deep_methods_compare_unless_told_not_to(project_copy, tiny_checkpoint: Path) -> None:

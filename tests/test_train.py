@@ -281,7 +281,7 @@ def test_correspondences_need_to_know_where_points_are_and_take_no_teacher(
     blind = [dataclasses.replace(scene, observations=None) for scene in flights[:2]]
     with pytest.raises(InputError, match=f"{blind[0].name}.* annotate again"):
         train(blind, [], options, tmp_path / "run")
-    with pytest.raises(InputError, match="leave teacher out"):
+    with pytest.raises(InputError, match="leave `teacher` out"):
         train(flights[:2], [], change(options, teacher="start"), tmp_path / "run")
 
 
@@ -420,7 +420,7 @@ def test_a_disk_too_small_for_the_features_is_one_sentence(
 ) -> None:
     usage = shutil.disk_usage(tmp_path)._replace(free=1000)
     monkeypatch.setattr(shutil, "disk_usage", lambda path: usage)
-    with pytest.raises(InputError, match="make room, or lower --views"):
+    with pytest.raises(InputError, match="make room, or lower `views`"):
         train(flights[:2], [], change(options, views=2), tmp_path / "run")
 
 
@@ -472,11 +472,11 @@ def test_recipes_are_read_and_checked(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("settings", "said"),
     [
-        ({"loss": "softest"}, "loss is 'softest'; it is one of ranked-list"),
-        ({"epochs": 0}, "epochs is 0"),
-        ({"scale_max": 0.1}, "below scale_min"),
-        ({"rotations": 3}, "rotations is 3"),
-        ({"views": 2}, "say with frozen"),
+        ({"loss": "softest"}, "`loss` is 'softest'; it is one of ranked-list"),
+        ({"epochs": 0}, "`epochs` is 0"),
+        ({"scale_max": 0.1}, "below `scale_min`"),
+        ({"rotations": 3}, "`rotations` is 3"),
+        ({"views": 2}, "say with `frozen`"),
     ],
 )
 def test_settings_that_cannot_work_are_refused(settings: dict[str, object], said: str) -> None:

@@ -1,8 +1,13 @@
 """Jobs in processes of their own: one that crashes loses its own work only."""
 
+import logging
 import os
 from collections.abc import Callable
+from functools import partial
 
+import pycolmap
+
+from colmap_netvlad.colmap import engine
 from colmap_netvlad.runtime import workers
 from colmap_netvlad.runtime.errors import InputError
 from colmap_netvlad.runtime.workers import Job
@@ -56,3 +61,36 @@ def test_faults_and_crashes_are_told_apart_and_lose_no_other_job() -> None:
 
 def test_no_jobs_are_no_work() -> None:
     assert workers.run([], 4, lambda count: None) == []
+
+
+def remember(value: int) -> None:
+    global remembered
+    remembered = value
+
+
+def recall(advance: Callable[[int], None]) -> None:
+    raise InputError(str(remembered))
+
+
+def test_the_initialiser_runs_in_each_worker_before_its_job() -> None:
+    outcomes = workers.run(
+        [Job(recall, ()), Job(recall, ())], 2, lambda count: None, initialiser=partial(remember, 7)
+    )
+    assert [outcome.fault for outcome in outcomes] == ["7", "7"]
+
+
+def log_level(advance: Callable[[int], None]) -> None:
+    level = logging.getLogger("colmap_netvlad").level
+    raise InputError(f"{level} {pycolmap.logging.minloglevel}")
+
+
+def test_a_worker_is_as_talkative_as_its_parent(monkeypatch) -> None:
+    said = []
+    for level in (logging.INFO, logging.DEBUG):
+        monkeypatch.setattr(logging.getLogger("colmap_netvlad"), "level", level)
+        logging.getLogger("colmap_netvlad").manager._clear_cache()
+        (outcome,) = workers.run(
+            [Job(log_level, ())], 1, lambda count: None, initialiser=engine.initialiser()
+        )
+        said.append(outcome.fault)
+    assert said == ["20 3", "10 0"]

@@ -1,4 +1,4 @@
-"""Local features of a photo: what a network saw at each place, kept small."""
+"""What a network saw at each place of a photo, cell by cell, kept small."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 
 @dataclass(frozen=True, eq=False)
-class LocalFeatures:
-    """One feature for each cell of a grid over a photo.
+class Cells:
+    """One feature of a network for each cell of a grid over a photo.
 
     Attributes:
         codes: (h, w, D) int8, each feature stretched to -127..127; zeros where the photo has no
@@ -21,7 +21,7 @@ class LocalFeatures:
     codes: NDArray[np.int8]
 
     @classmethod
-    def of(cls, features: NDArray[np.floating]) -> LocalFeatures:
+    def of(cls, features: NDArray[np.floating]) -> Cells:
         """Encode features (D, h, w) of any length."""
         largest = np.maximum(np.abs(features).max(axis=0), 1e-12)
         codes = np.round(127 * features / largest).astype(np.int8)

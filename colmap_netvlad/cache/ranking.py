@@ -28,6 +28,7 @@ class Ranking:
         left_out: (image name, reason) of images that could not be described; their rows are
             empty.
         compared: whether its candidates were compared place by place (`retrieval.rerank`).
+        every_pair: whether it stands for all pairs, which no k cuts.
     """
 
     names: tuple[str, ...]
@@ -39,6 +40,7 @@ class Ranking:
     notes: tuple[str, ...] = field(default=())
     left_out: tuple[tuple[str, str], ...] = field(default=())
     compared: bool = False
+    every_pair: bool = False
 
     def __post_init__(self) -> None:
         shape = (len(self.names), self.partners.shape[1])
@@ -54,7 +56,10 @@ class Ranking:
         return int(self.partners.shape[1])
 
     def top(self, k: int) -> Ranking:
-        """Return the ranking cut to the first `k` partners of each image."""
+        """Return the ranking cut to the first `k` partners of each image, unless it is of all
+        pairs."""
+        if self.every_pair:
+            return self
         return replace(self, partners=self.partners[:, :k], scores=self.scores[:, :k])
 
 

@@ -1,4 +1,4 @@
-"""The cache beside the database: descriptors, local features, rankings, settings, in one file.
+"""The cache beside the database: photos seen, descriptors, cells, settings, in one file.
 
 Descriptors are kept by image name, content fingerprint of the photo and fingerprint of the
 model, so that a second run computes nothing, ten new photos cost ten photos, and a photo
@@ -13,8 +13,9 @@ from __future__ import annotations
 
 import os
 import sqlite3
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import TracebackType
 
@@ -22,12 +23,14 @@ import numpy as np
 import sqlite_utils
 from numpy.typing import NDArray
 
-from colmap_netvlad.cache.cells import LocalFeatures
-from colmap_netvlad.cache.ranking import NO_PARTNER, Ranking, from_lists
+from colmap_netvlad.cache.cells import Cells
 from colmap_netvlad.runtime.errors import InputError
 
-FORMAT = 1
+FORMAT = 2
 """Version of the tables below, kept in `PRAGMA user_version`."""
+
+READ_FORMATS = (1, FORMAT)
+"""Versions that are read; an older one is brought up to date."""
 
 APPLICATION = 0x4E56_4C44
 """`PRAGMA application_id` that marks the file as ours ("NVLD")."""
@@ -35,8 +38,27 @@ APPLICATION = 0x4E56_4C44
 BUSY_SECONDS = 60.0
 """How long one process waits for another's transaction."""
 
+ORPHANS_SETTING = "orphans"
+"""Set where cells were replaced: what was counted for the old ones is pruned at the next open."""
+
 IMAGES_SETTING = "images"
 """The photo folder: absolute, or relative to the cache where it lies below it."""
+
+
+@dataclass(frozen=True)
+class SeenPhoto:
+    """What is known of a photo file as long as its size and time stay the same.
+
+    Attributes:
+        stamp: size and time of the file.
+        content: fingerprint of what is in it, or None where it was not needed yet.
+        gps: latitude, longitude, height as JSON; "" where the photo has none; None where nobody
+            looked yet.
+    """
+
+    stamp: str
+    content: str | None = None
+    gps: str | None = None
 
 
 class Store:
@@ -72,6 +94,21 @@ class Store:
         """Close the file."""
         self._db.conn.close()
 
+    # Photos
+
+    def photos(self) -> dict[str, SeenPhoto]:
+        """Return what is known of photo files, by the key they were kept under."""
+        with self._faults():
+            rows = self._db.execute("SELECT file, stamp, content, gps FROM photos")
+            return {file: SeenPhoto(*rest) for file, *rest in rows.fetchall()}
+
+    def keep_photos(self, seen: Mapping[str, SeenPhoto]) -> None:
+        """Keep what is known of photo files in one transaction."""
+        if seen:
+            rows = ({"file": file, **asdict(photo)} for file, photo in seen.items())
+            with self._transaction():
+                self._db["photos"].insert_all(rows, replace=True)
+
     # Descriptors
 
     def described(self, model: str) -> dict[str, str]:
@@ -87,7 +124,7 @@ class Store:
         photos: Sequence[str],
         vectors: NDArray[np.floating],
         seconds: float,
-        local: Sequence[LocalFeatures] = (),
+        cells: Sequence[Cells] = (),
     ) -> None:
         """Keep a batch of descriptors in one transaction; older ones of these images go.
 
@@ -97,7 +134,7 @@ class Store:
             photos: B fingerprints of the photos the vectors were computed from.
             vectors: (B, D) descriptors, L2-normalised.
             seconds: what describing the batch took, s.
-            local: B photos' local features, or none of them.
+            cells: of the B photos, or none.
         """
         share = seconds / max(len(names), 1)
         rows = (
@@ -115,15 +152,21 @@ class Store:
                 "model": model,
                 "image": name,
                 "photo": photo,
-                "height": features.codes.shape[0],
-                "width": features.codes.shape[1],
-                "codes": features.codes.tobytes(),
+                "height": grid.codes.shape[0],
+                "width": grid.codes.shape[1],
+                "codes": grid.codes.tobytes(),
             }
-            for name, photo, features in zip(names, photos, local, strict=False)
+            for name, photo, grid in zip(names, photos, cells, strict=False)
         )
         with self._transaction():
+            if cells and self._has_cells(model, names):
+                self._db["settings"].insert({"key": ORPHANS_SETTING, "value": "1"}, replace=True)
             self._db["descriptors"].insert_all(rows, replace=True)
-            self._db["local_features"].insert_all(codes, replace=True)
+            self._db["cells"].insert_all(codes, replace=True)
+
+    def _has_cells(self, model: str, names: Sequence[str]) -> bool:
+        query = "SELECT 1 FROM cells WHERE model = ? AND image = ?"
+        return any(self._db.execute(query, [model, name]).fetchone() for name in names)
 
     def seconds(self, model: str, names: Iterable[str]) -> float:
         """Return what describing these images took when it was done, s."""
@@ -154,47 +197,43 @@ class Store:
                 blobs.append(row[0])
         return np.frombuffer(b"".join(blobs), np.float16).reshape(len(blobs), -1)
 
-    # Local features
+    # Cells: what networks saw, place by place
 
-    def described_locally(self, model: str) -> dict[str, str]:
-        """Return the photo's fingerprint by image name, of all images with local features."""
+    def described_in_cells(self, model: str) -> dict[str, str]:
+        """Return the photo's fingerprint by image name, of all images with cells."""
         with self._faults():
-            rows = self._db.execute(
-                "SELECT image, photo FROM local_features WHERE model = ?", [model]
-            )
+            rows = self._db.execute("SELECT image, photo FROM cells WHERE model = ?", [model])
             return dict(rows.fetchall())
 
-    def local_numbers(self, model: str) -> dict[str, int]:
-        """Return the number of each image's local features, by image name.
+    def cell_numbers(self, model: str) -> dict[str, int]:
+        """Return the number of each image's cells, by image name.
 
-        A number is never given again: features of a changed photo have another one.
+        A number is never given again: the cells of a changed photo have another one.
         """
         with self._faults():
-            rows = self._db.execute(
-                "SELECT image, number FROM local_features WHERE model = ?", [model]
-            )
+            rows = self._db.execute("SELECT image, number FROM cells WHERE model = ?", [model])
             return dict(rows.fetchall())
 
-    def read_local(self, number: int) -> LocalFeatures:
-        """Return the local features of that number.
+    def read_cells(self, number: int) -> Cells:
+        """Return the cells of that number.
 
         Raises:
             KeyError: there are none.
         """
         with self._faults():
             row = self._db.execute(
-                "SELECT height, width, codes FROM local_features WHERE number = ?", [number]
+                "SELECT height, width, codes FROM cells WHERE number = ?", [number]
             ).fetchone()
         if row is None:
             raise KeyError(number)
         height, width, codes = row
-        return LocalFeatures(np.frombuffer(codes, np.int8).reshape(height, width, -1))
+        return Cells(np.frombuffer(codes, np.int8).reshape(height, width, -1))
 
     def agreements(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
         """Return what was counted so far, in the order of the numbers.
 
         Returns:
-            (M, 2) numbers of two local features, lower first; (M,) their agreeing matches;
+            (M, 2) numbers of two photos' cells, lower first; (M,) their agreeing matches;
             (M,) what counting them took, s.
         """
         row = np.dtype([("pair", np.int64, 2), ("matches", np.int64), ("seconds", np.float64)])
@@ -210,52 +249,6 @@ class Store:
         """Keep (first, second, matches, seconds) of compared pairs in one transaction."""
         with self._transaction():
             self._db.conn.executemany("INSERT OR REPLACE INTO agreements VALUES (?, ?, ?, ?)", rows)
-
-    # Rankings
-
-    def save_ranking(self, ranking: Ranking, model: str = "") -> None:
-        """Keep every image's partners with rank (from 1) and score; the method's older one goes.
-
-        Args:
-            ranking: what to keep.
-            model: fingerprint of the model, where the method has one.
-        """
-        rows = (
-            {
-                "method": ranking.method,
-                "model": model,
-                "image": name,
-                "rank": rank,
-                "partner": ranking.names[j],
-                "score": score,
-            }
-            for name, partners, scores in zip(
-                ranking.names, ranking.partners.tolist(), ranking.scores.tolist(), strict=True
-            )
-            for rank, (j, score) in enumerate(zip(partners, scores, strict=True), start=1)
-            if j != NO_PARTNER
-        )
-        with self._transaction():
-            self._db.execute("DELETE FROM rankings WHERE method = ?", [ranking.method])
-            self._db["rankings"].insert_all(rows)
-
-    def load_ranking(self, method: str, names: Sequence[str]) -> Ranking | None:
-        """Return the kept ranking of a method over `names`, or None where there is none.
-
-        Images that the kept ranking does not know have no partners, partners that are not in
-        `names` are dropped.
-        """
-        index = {name: i for i, name in enumerate(names)}
-        lists: list[list[tuple[int, float]]] = [[] for _ in names]
-        with self._faults():
-            rows = self._db.execute(
-                "SELECT image, partner, score FROM rankings WHERE method = ? ORDER BY image, rank",
-                [method],
-            ).fetchall()
-        for image, partner, score in rows:
-            if image in index and partner in index:
-                lists[index[image]].append((index[partner], score))
-        return from_lists(tuple(names), lists, method) if rows else None
 
     # Codebooks
 
@@ -302,42 +295,34 @@ class Store:
         tables = self._pragma("schema_version")
         if application != APPLICATION and tables:
             raise InputError(
-                f"{self.path} is not a cache of colmap-netvlad; name another file with --cache."
+                f"{self.path} is not a cache of colmap-netvlad; name another file with `cache`."
             )
         version = self._pragma("user_version")
-        if tables and version != FORMAT:
+        if tables and version not in READ_FORMATS:
             raise InputError(
                 f"The cache {self.path} has format {version}, this version of colmap-netvlad reads "
                 f"format {FORMAT}; delete the file (it is made again), or name another with "
-                "--cache."
+                "`cache`."
             )
         if not tables:
+            # Large pages: a descriptor of 64 KiB then lies in few of them.
+            self._db.execute("PRAGMA page_size = 32768")
+            self._db.execute("PRAGMA journal_mode = WAL")
+        if version != FORMAT:
             self._create()
-        elif "agreements" not in self._db.table_names():  # the cache of an older version
-            with self._transaction():
-                self._create_local()
+        if self.setting(ORPHANS_SETTING):
+            self._prune()
 
     def _create(self) -> None:
-        # Large pages: a descriptor of 64 KiB then lies in few of them.
-        self._db.execute("PRAGMA page_size = 32768")
-        self._db.execute("PRAGMA journal_mode = WAL")
+        """Make the tables, or bring those of an older version up to date."""
         with self._transaction():
+            if "local_features" in self._db.table_names():
+                self._db.execute("ALTER TABLE local_features RENAME TO cells")
+            self._db.execute("DROP TABLE IF EXISTS rankings")
             self._db["descriptors"].create(
                 {"model": str, "image": str, "photo": str, "seconds": float, "vector": bytes},
                 pk=("model", "image"),
                 not_null={"photo", "seconds", "vector"},
-                if_not_exists=True,
-            )
-            self._db["rankings"].create(
-                {
-                    "method": str,
-                    "model": str,
-                    "image": str,
-                    "rank": int,
-                    "partner": str,
-                    "score": float,
-                },
-                pk=("method", "image", "rank"),
                 if_not_exists=True,
             )
             self._db["codebooks"].create(
@@ -346,23 +331,35 @@ class Store:
                 if_not_exists=True,
             )
             self._db["settings"].create({"key": str, "value": str}, pk="key", if_not_exists=True)
-            self._create_local()
+            self._db["photos"].create(
+                {"file": str, "stamp": str, "content": str, "gps": str},
+                pk="file",
+                not_null={"stamp"},
+                if_not_exists=True,
+            )
+            # AUTOINCREMENT: the number of cells that are gone is not given again.
+            self._db.execute(
+                "CREATE TABLE IF NOT EXISTS cells (number INTEGER PRIMARY KEY AUTOINCREMENT,"
+                " model TEXT NOT NULL, image TEXT NOT NULL, photo TEXT NOT NULL,"
+                " height INTEGER NOT NULL, width INTEGER NOT NULL, codes BLOB NOT NULL,"
+                " UNIQUE (model, image))"
+            )
+            self._db.execute(
+                "CREATE TABLE IF NOT EXISTS agreements (first INTEGER, second INTEGER,"
+                " matches INTEGER NOT NULL, seconds REAL NOT NULL, PRIMARY KEY (first, second))"
+                " WITHOUT ROWID"
+            )
             self._db.execute(f"PRAGMA application_id = {APPLICATION}")
             self._db.execute(f"PRAGMA user_version = {FORMAT}")
 
-    def _create_local(self) -> None:
-        # AUTOINCREMENT: the number of features that are gone is not given again.
-        self._db.execute(
-            "CREATE TABLE IF NOT EXISTS local_features (number INTEGER PRIMARY KEY AUTOINCREMENT,"
-            " model TEXT NOT NULL, image TEXT NOT NULL, photo TEXT NOT NULL,"
-            " height INTEGER NOT NULL, width INTEGER NOT NULL, codes BLOB NOT NULL,"
-            " UNIQUE (model, image))"
-        )
-        self._db.execute(
-            "CREATE TABLE IF NOT EXISTS agreements (first INTEGER, second INTEGER,"
-            " matches INTEGER NOT NULL, seconds REAL NOT NULL, PRIMARY KEY (first, second))"
-            " WITHOUT ROWID"
-        )
+    def _prune(self) -> None:
+        """Forget what was counted for cells that have been replaced since."""
+        with self._transaction():
+            self._db.execute(
+                "DELETE FROM agreements WHERE first NOT IN (SELECT number FROM cells)"
+                " OR second NOT IN (SELECT number FROM cells)"
+            )
+            self._db.execute("DELETE FROM settings WHERE key = ?", [ORPHANS_SETTING])
 
     def _pragma(self, name: str) -> int:
         return int(self._db.execute(f"PRAGMA {name}").fetchone()[0])
@@ -430,5 +427,5 @@ def _sentence(path: Path, fault: str) -> str:
     folder = "" if os.access(path.parent, os.W_OK) else " (the folder cannot be written)"
     return (
         f"Cannot use the cache {path}: {fault}{folder}; name a file in a folder that can be "
-        "written with --cache."
+        "written with `cache`."
     )

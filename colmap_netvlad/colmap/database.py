@@ -9,6 +9,7 @@ tell 3.10 from 3.13.
 
 from __future__ import annotations
 
+import hashlib
 import sqlite3
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
@@ -20,13 +21,15 @@ from numpy.typing import NDArray
 
 from colmap_netvlad.photos.positions import CoordinateSystem, PosePrior
 from colmap_netvlad.runtime.errors import InputError
-from colmap_netvlad.runtime.files import atomic_path
 
 MAX_NUM_IMAGES = 2147483647
 """COLMAP's factor in `pair_id = MAX_NUM_IMAGES * min(id1, id2) + max(id1, id2)`."""
 
 BUSY_SECONDS = 5.0
 """How long a read waits for another process's write, s; COLMAP itself waits not at all."""
+
+FINGERPRINT_BYTES = 1024
+"""Bytes of an image's descriptors that tell them from others, 8 SIFT features."""
 
 SIFT_BYTES = 128
 """Bytes of one SIFT descriptor; `descriptors.cols` counts bytes."""
@@ -55,15 +58,20 @@ def images_of_pair(pair: int) -> tuple[int, int]:
 
 
 class Database:
-    """A COLMAP database, read only. Made by `open_database`."""
+    """A COLMAP database, read only. Made by `open_database`.
+
+    Attributes:
+        connection: sqlite's, which refuses to write.
+        path: the file.
+    """
 
     def __init__(self, connection: sqlite3.Connection, path: Path) -> None:
-        self._connection = connection
+        self.connection = connection
         self.path = path
 
     def images(self) -> list[ImageRow]:
         """Return all images in the order of their ids."""
-        rows = self._connection.execute(
+        rows = self.connection.execute(
             "SELECT i.image_id, i.name, i.camera_id, COALESCE(c.width, 0), COALESCE(c.height, 0)"
             " FROM images i LEFT JOIN cameras c USING (camera_id) ORDER BY i.image_id"
         )
@@ -71,24 +79,24 @@ class Database:
 
     def keypoint_counts(self) -> dict[int, int]:
         """Return the number of keypoints by image id; images without features are absent."""
-        return dict(self._connection.execute("SELECT image_id, rows FROM keypoints WHERE rows > 0"))
+        return dict(self.connection.execute("SELECT image_id, rows FROM keypoints WHERE rows > 0"))
 
     def descriptor_counts(self) -> dict[int, int]:
         """Return the number of local descriptors by image id; images without are absent."""
         return dict(
-            self._connection.execute("SELECT image_id, rows FROM descriptors WHERE rows > 0")
+            self.connection.execute("SELECT image_id, rows FROM descriptors WHERE rows > 0")
         )
 
     def images_with_features(self) -> set[int]:
         """Return the ids of images whose features COLMAP would not extract again (even if 0)."""
-        rows = self._connection.execute(
+        rows = self.connection.execute(
             "SELECT image_id FROM keypoints INTERSECT SELECT image_id FROM descriptors"
         )
         return {image_id for (image_id,) in rows}
 
     def keypoints(self, image_id: int) -> NDArray[np.float32]:
         """Return (N, 2) keypoint positions x, y in pixels (COLMAP's: centre of pixel 0 is 0.5)."""
-        row = self._connection.execute(
+        row = self.connection.execute(
             "SELECT rows, cols, data FROM keypoints WHERE image_id = ?", (image_id,)
         ).fetchone()
         if row is None or not row[0]:
@@ -101,7 +109,7 @@ class Database:
         Raises:
             InputError: the local features are of another kind (ALIKED, say).
         """
-        row = self._connection.execute(
+        row = self.connection.execute(
             "SELECT rows, cols, data FROM descriptors WHERE image_id = ?", (image_id,)
         ).fetchone()
         if row is None or not row[0]:
@@ -113,9 +121,24 @@ class Database:
             )
         return np.frombuffer(row[2], np.uint8).reshape(row[0], SIFT_BYTES)
 
+    def feature_fingerprints(self) -> dict[int, str]:
+        """Return a fingerprint of each image's local descriptors, by image id.
+
+        Of their number, kind and first `FINGERPRINT_BYTES`, so that no descriptor has to be read:
+        features extracted again differ there.
+        """
+        rows = self.connection.execute(
+            "SELECT image_id, rows, cols, substr(data, 1, ?) FROM descriptors WHERE rows > 0",
+            (FINGERPRINT_BYTES,),
+        )
+        return {
+            image_id: hashlib.sha256(b"%d %d " % (count, size) + head).hexdigest()
+            for image_id, count, size, head in rows
+        }
+
     def matched_pairs(self) -> set[tuple[int, int]]:
         """Return the pairs COLMAP's matchers would skip: those with matches and a geometry."""
-        rows = self._connection.execute(
+        rows = self.connection.execute(
             "SELECT pair_id FROM matches INTERSECT SELECT pair_id FROM two_view_geometries"
         )
         return {images_of_pair(pair) for (pair,) in rows}
@@ -125,12 +148,12 @@ class Database:
 
         Pairs that were tried and failed have 0.
         """
-        rows = self._connection.execute("SELECT pair_id, rows FROM two_view_geometries")
+        rows = self.connection.execute("SELECT pair_id, rows FROM two_view_geometries")
         return {images_of_pair(pair): count for pair, count in rows}
 
     def inlier_matches(self, image_id1: int, image_id2: int) -> NDArray[np.uint32]:
         """Return (M, 2) keypoint indices of the verified matches, columns as the ids are given."""
-        row = self._connection.execute(
+        row = self.connection.execute(
             "SELECT rows, data FROM two_view_geometries WHERE pair_id = ?",
             (pair_id(image_id1, image_id2),),
         ).fetchone()
@@ -158,7 +181,7 @@ class Database:
         else:
             return {}
         priors = {}
-        for image_id, blob, system in self._connection.execute(query):
+        for image_id, blob, system in self.connection.execute(query):
             position = np.frombuffer(blob or b"", np.float64)
             if position.size == 3 and np.isfinite(position).all():
                 x, y, z = position.tolist()
@@ -174,7 +197,7 @@ class Database:
         if not {"corr_data_id", "position_covariance"} <= self._columns("pose_priors"):
             return {}
         deviations = {}
-        for image_id, blob in self._connection.execute(
+        for image_id, blob in self.connection.execute(
             "SELECT corr_data_id, position_covariance FROM pose_priors WHERE corr_sensor_type = 0"
         ):
             covariance = np.frombuffer(blob or b"", np.float64)
@@ -188,13 +211,13 @@ class Database:
         if not self._columns("frame_data"):
             return {}
         return dict(
-            self._connection.execute(
+            self.connection.execute(
                 "SELECT data_id, frame_id FROM frame_data WHERE sensor_type = 0"
             )
         )
 
     def _legacy_priors(self) -> dict[int, PosePrior]:
-        rows = self._connection.execute(
+        rows = self.connection.execute(
             "SELECT image_id, prior_tx, prior_ty, prior_tz FROM images"
             " WHERE prior_tx IS NOT NULL AND prior_ty IS NOT NULL AND prior_tz IS NOT NULL"
         )
@@ -205,18 +228,21 @@ class Database:
         }
 
     def _columns(self, table: str) -> set[str]:
-        return {row[1] for row in self._connection.execute(f"PRAGMA table_info({table})")}
+        return {row[1] for row in self.connection.execute(f"PRAGMA table_info({table})")}
 
 
 @contextmanager
-def open_database(path: Path) -> Iterator[Database]:
+def open_database(path: Path, wait: float = BUSY_SECONDS) -> Iterator[Database]:
     """Open a COLMAP database of version 3.8 to 4.2 for reading; the file stays byte-identical.
+
+    Args:
+        wait: how long to wait for another process's write, s.
 
     Raises:
         InputError: it is not there, not sqlite, not COLMAP's, or locked by another process.
     """
     try:
-        with closing(_connect(path)) as connection:
+        with closing(_connect(path, wait)) as connection:
             yield Database(connection, path)
     except sqlite3.OperationalError as fault:
         if "locked" in str(fault) or "busy" in str(fault):
@@ -230,16 +256,16 @@ def open_database(path: Path) -> Iterator[Database]:
         ) from fault
 
 
-def _connect(path: Path) -> sqlite3.Connection:
+def _connect(path: Path, wait: float) -> sqlite3.Connection:
     if not path.is_file():
-        raise InputError(f"The database {path} does not exist; mend --db.")
+        raise InputError(f"The database {path} does not exist; mend `database`.")
     uri = path.resolve().as_uri()
     wal = path.with_name(path.name + "-wal")
     # A WAL database at rest is opened for writing and then only queried: a read-only connection
     # could not take away the -wal and -shm files it makes beside the user's database.
     mode = "rw" if _is_wal(path) and not wal.exists() else "ro"
     connection = sqlite3.connect(
-        f"{uri}?mode={mode}", uri=True, timeout=BUSY_SECONDS, check_same_thread=False
+        f"{uri}?mode={mode}", uri=True, timeout=wait, check_same_thread=False
     )
     try:
         connection.execute("PRAGMA query_only = ON")
@@ -279,27 +305,3 @@ def image_names(path: Path) -> tuple[str, ...]:
     """Return the image names of a database, in the order of the image ids."""
     with open_database(path) as database:
         return tuple(row.name for row in database.images())
-
-
-def copy_database(source: Path, target: Path, *, matches: bool) -> None:
-    """Copy a database consistently (sqlite's backup, so a waiting log is included).
-
-    Args:
-        matches: False leaves matches and two-view geometries out, so that nothing one method
-            matched leaks into another's result.
-
-    Raises:
-        InputError: the source cannot be read, or the target not be written.
-    """
-    with (
-        open_database(source) as database,
-        atomic_path(target) as temporary,
-        closing(sqlite3.connect(temporary)) as copy,
-    ):
-        database._connection.backup(copy)
-        if not matches:
-            copy.execute("DELETE FROM matches")
-            copy.execute("DELETE FROM two_view_geometries")
-            copy.commit()
-            copy.execute("VACUUM")
-        copy.execute("PRAGMA journal_mode = DELETE")

@@ -9,6 +9,7 @@ two copies of sqlite in one process undo each other's file locks.
 
 from __future__ import annotations
 
+import logging
 import os
 import shutil
 import sqlite3
@@ -16,13 +17,13 @@ import tempfile
 import threading
 from collections.abc import Callable
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
 import pycolmap
 
 from colmap_netvlad.colmap.database import open_database
-from colmap_netvlad.runtime import progress
 from colmap_netvlad.runtime.errors import InputError
 
 Result = TypeVar("Result")
@@ -34,6 +35,8 @@ LOCK_SECONDS = 5.0
 """How long to wait for another process's lock before saying so."""
 
 WATCH_SECONDS = 0.2
+
+_logger = logging.getLogger("colmap_netvlad")
 
 _QUIET = 3  # glog: only fatal messages
 
@@ -58,7 +61,7 @@ def check_writable(database: Path) -> None:
     with open_database(database):
         pass
     if not os.access(database, os.W_OK):
-        raise InputError(f"{database} is read-only; make it writable, or work on a --copy.")
+        raise InputError(f"{database} is read-only; make it writable, or work on a copy.")
     try:
         with closing(sqlite3.connect(database, timeout=LOCK_SECONDS)) as connection:
             connection.isolation_level = None
@@ -115,9 +118,19 @@ def call(function: Callable[..., Result], folder: Path, *arguments: Any, **optio
 
 
 def silence() -> None:
-    """Let only COLMAP's fatal messages through, unless -v was given."""
-    pycolmap.logging.minloglevel = 0 if progress.verbose else _QUIET
+    """Let only COLMAP's fatal messages through, unless our own logger is at DEBUG."""
+    pycolmap.logging.minloglevel = 0 if _logger.isEnabledFor(logging.DEBUG) else _QUIET
     pycolmap.logging.logtostderr = True
+
+
+def initialiser() -> Callable[[], None]:
+    """Return what a worker (`runtime.workers`) calls first, to log as much as this process."""
+    return partial(_log_at, _logger.getEffectiveLevel())
+
+
+def _log_at(level: int) -> None:
+    _logger.setLevel(level)
+    silence()
 
 
 def _check_space(folder: Path) -> None:

@@ -8,7 +8,6 @@ next one.
 
 from __future__ import annotations
 
-import os
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -29,7 +28,7 @@ from colmap_netvlad.photos.files import (
 from colmap_netvlad.photos.masks import find_mask
 from colmap_netvlad.runtime import progress
 from colmap_netvlad.runtime.errors import InputError
-from colmap_netvlad.runtime.machine import usable_processors
+from colmap_netvlad.runtime.machine import usable_memory, usable_processors
 
 CHUNK_PHOTOS = 8
 """Photos of one chunk for each thread; the bar moves once a chunk."""
@@ -144,24 +143,21 @@ class _Group:
 
 def _check_input(images: Path, options: FeatureOptions) -> list[str]:
     if not images.is_dir():
-        raise InputError(f"The photo folder {images} does not exist; mend --images.")
+        raise InputError(f"The photo folder {images} does not exist; mend `images`.")
     if options.camera not in CAMERA_MODES:
-        raise InputError(f"--camera is {options.camera}; choose {', '.join(CAMERA_MODES)}.")
+        raise InputError(f"`camera` is {options.camera}; choose {', '.join(CAMERA_MODES)}.")
     if options.camera_model not in pycolmap.CameraModelId.__members__:
-        raise InputError(f"COLMAP has no camera model {options.camera_model}; mend --camera-model.")
+        raise InputError(f"COLMAP has no camera model {options.camera_model}; mend `camera_model`.")
     if options.masks is not None and not options.masks.is_dir():
-        raise InputError(f"The mask folder {options.masks} does not exist; mend --masks.")
-    for value, option in (
-        (options.max_image_size, "--max-image-size"),
-        (options.max_features, "--max-features"),
-        (options.threads, "--threads"),
-    ):
+        raise InputError(f"The mask folder {options.masks} does not exist; mend `masks`.")
+    for name in ("max_image_size", "max_features", "threads"):
+        value = getattr(options, name)
         if value is not None and value < 1:
-            raise InputError(f"{option} is {value}; it must be at least 1.")
+            raise InputError(f"`{name}` is {value}; it must be at least 1.")
     names = find_photos(images)
     if not names:
         raise InputError(
-            f"There are no photos in {images} ({' '.join(sorted(PHOTO_SUFFIXES))}); mend --images."
+            f"There are no photos in {images} ({' '.join(sorted(PHOTO_SUFFIXES))}); mend `images`."
         )
     return names
 
@@ -236,7 +232,7 @@ def _group(
             (first, a), (second, b) = list(sizes.items())[:2]
             raise InputError(
                 f"Photos of one camera must have one size, but {a} has {first[0]} x {first[1]} "
-                f"pixels and {b} {second[0]} x {second[1]}; use --camera auto."
+                f"pixels and {b} {second[0]} x {second[1]}; use `camera` auto."
             )
         camera_id = row.camera_id if row is not None else None
         groups.append(_Group(pycolmap.CameraMode.SINGLE, camera_id, names))
@@ -263,7 +259,6 @@ def _extract_group(
     images: Path, database: Path, group: _Group, options: FeatureOptions, bar: progress.Step
 ) -> None:
     reader = pycolmap.ImageReaderOptions()
-    reader.camera_model = options.camera_model
     if options.masks is not None:
         reader.mask_path = options.masks
     extraction = pycolmap.FeatureExtractionOptions()
@@ -274,21 +269,38 @@ def _extract_group(
     size = CHUNK_PHOTOS * extraction.num_threads
     for start in range(0, len(group.names), size):
         chunk = group.names[start : start + size]
-        if group.camera_id is not None:
-            reader.existing_camera_id = group.camera_id
+        _import(images, database, group, options, chunk)
         engine.call(
             pycolmap.extract_features,
             database.parent,
             database,
             images,
             image_names=chunk,
-            camera_mode=group.mode,
+            camera_mode=pycolmap.CameraMode.AUTO,
             reader_options=reader,
             extraction_options=extraction,
         )
-        if group.mode == pycolmap.CameraMode.SINGLE and group.camera_id is None:
-            group.camera_id = _camera_of(database, chunk)
         bar.advance(len(chunk))
+
+
+def _import(
+    images: Path, database: Path, group: _Group, options: FeatureOptions, names: Sequence[str]
+) -> None:
+    """Import the photos of a chunk that the database does not have yet.
+
+    Apart from the extraction, whose threads would number the photos in the order they finish:
+    ids follow the names, and two runs make the same database.
+    """
+    if group.mode == pycolmap.CameraMode.AUTO:
+        return
+    reader = pycolmap.ImageReaderOptions()
+    reader.camera_model = options.camera_model
+    if group.camera_id is not None:
+        reader.existing_camera_id = group.camera_id
+    pycolmap.Database.open(database).close()  # makes it where it is not there
+    pycolmap.import_images(database, images, group.mode, list(names), reader)
+    if group.mode == pycolmap.CameraMode.SINGLE and group.camera_id is None:
+        group.camera_id = _camera_of(database, names)
 
 
 def _camera_of(database: Path, names: Iterable[str]) -> int | None:
@@ -301,14 +313,9 @@ def _threads(options: FeatureOptions) -> int:
     """As many threads as processors, unless SIFT's scale space would fill half the memory."""
     if options.threads is not None:
         return options.threads
-    processors = usable_processors()
-    try:
-        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    except (AttributeError, ValueError, OSError):
-        return processors
     side = options.max_image_size or SIFT_LONG_SIDE
     scale_space = SIFT_LEVELS * 4 * (2 * side) * (2 * side) * 3 / 4
-    return max(1, min(processors, int(memory / 2 / scale_space)))
+    return max(1, min(usable_processors(), int(usable_memory() / 2 / scale_space)))
 
 
 def _report(

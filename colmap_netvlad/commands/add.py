@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +11,7 @@ import numpy as np
 from colmap_netvlad.cache.ranking import NO_PARTNER, Ranking
 from colmap_netvlad.colmap.database import image_names
 from colmap_netvlad.colmap.features import FeatureOptions, FeatureReport, extract_features
-from colmap_netvlad.mapping.extend import extend_model, read_model
+from colmap_netvlad.mapping.extend import extend_model, largest_model, read_model
 from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.mapping.output import free_output
 from colmap_netvlad.mapping.summary import ModelSummary, registered_names, summarize
@@ -19,8 +19,9 @@ from colmap_netvlad.matching.run import MatchOptions, MatchReport, match_pairs
 from colmap_netvlad.photos.files import find_photos
 from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval.options import RetrievalOptions
-from colmap_netvlad.retrieval.rank import rank
+from colmap_netvlad.retrieval.rank import rank_project
 from colmap_netvlad.runtime.errors import InputError
+from colmap_netvlad.runtime.sequences import listed
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,7 @@ class AddOptions:
         seed: of matching and mapping.
     """
 
-    method: str
+    method: str = "hybrid"
     retrieval: RetrievalOptions = field(default_factory=RetrievalOptions)
     among_new: bool = False
     features: FeatureOptions = field(default_factory=FeatureOptions)
@@ -67,7 +68,10 @@ class AddReport:
 
 
 def add_photos(
-    project: Project, model: Path, options: AddOptions, output: Path | None = None
+    project: Project,
+    model: Path | None = None,
+    options: AddOptions = AddOptions(),
+    output: Path | None = None,
 ) -> AddReport:
     """Import the photos the database does not have, and register them into a model.
 
@@ -77,12 +81,13 @@ def add_photos(
     Args:
         project: its photo folder holds the new photos beside the old ones; its database gets
             their features and matches.
-        model: folder of the existing sparse model.
+        model: folder of the existing sparse model; None: see `newest_model`.
         output: folder of models for the extended one; default `sparse`, `sparse-2`, ...
 
     Raises:
         InputError: no new photos, a folder that lacks the old photos, or no such model.
     """
+    model = model or newest_model(project)
     folder = project.need_images()
     old = image_names(project.database)
     new = _new_photos(folder, old)
@@ -146,27 +151,27 @@ def add_lines(report: AddReport) -> list[str]:
     ]
     if report.unregistered:
         lines.append(
-            f"Not registered: {', '.join(report.unregistered[:10])}"
-            f"{', ...' if len(report.unregistered) > 10 else ''}; photos that overlap only other "
-            "new ones need --among-new, or `pairs` and `reconstruct` anew."
+            f"Not registered: {listed(report.unregistered)}; photos that overlap only other "
+            "new ones need `among_new`, or new pairs and a new model."
         )
     return [*lines, f"The extended model is in {report.output}."]
 
 
 def newest_model(project: Project) -> Path:
-    """Return `0` of the highest-numbered `sparse`, `sparse-2`, ... folder of a workspace.
+    """Return the largest model in the highest-numbered `sparse`, `sparse-2`, ... of a workspace.
 
     Raises:
         InputError: there is none.
     """
     folders = [project.sparse, *project.folder.glob(f"{project.sparse.name}-*")]
-    models = [folder / "0" for folder in folders if (folder / "0").is_dir()]
-    if not models:
-        raise InputError(
-            f"There is no model in {project.sparse}; run `colmap-netvlad reconstruct`, or name "
-            "one with --sparse."
-        )
-    return max(models, key=lambda model: _number(model.parent.name))
+    for folder in sorted(folders, key=lambda folder: _number(folder.name), reverse=True):
+        models = sorted(path for path in folder.glob("*") if path.name.isdigit())
+        if models:
+            return largest_model(models)
+    raise InputError(
+        f"There is no model in {project.sparse}; run `colmap-netvlad reconstruct`, or name one "
+        "with `sparse`."
+    )
 
 
 def _number(name: str) -> int:
@@ -191,13 +196,14 @@ def _new_photos(folder: Path, old: tuple[str, ...]) -> list[str]:
 
 def _pairs_of_new(project: Project, new: set[str], options: AddOptions) -> list[tuple[str, str]]:
     """Return each new photo with its k best partners among the old ones (or among all)."""
-    count = len(image_names(project.database))
-    deeper = min(options.retrieval.k + (0 if options.among_new else len(new)), count - 1)
-    ranking = rank(project, options.method, replace(options.retrieval, k=max(deeper, 1)))
+    k = options.retrieval.k
+    # Where new photos are not to be partners, a list full of them must not be the end of it.
+    least = k if options.among_new else k + len(new)
+    ranking = rank_project(project, options.method, options.retrieval, least)
     pairs: list[tuple[str, str]] = []
     for i, name in enumerate(ranking.names):
         if name in new:
-            partners = _partners(ranking, i, new, options.among_new)[: options.retrieval.k]
+            partners = _partners(ranking, i, new, options.among_new)[:k]
             pairs.extend((name, partner) for partner in partners)
     return pairs
 

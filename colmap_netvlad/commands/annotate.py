@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -11,7 +12,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_netvlad.colmap.database import ImageRow, copy_database, open_database
+from colmap_netvlad.colmap.copies import copy_database
+from colmap_netvlad.colmap.database import ImageRow, open_database
 from colmap_netvlad.photos.files import (
     PHOTO_SUFFIXES,
     BadPhoto,
@@ -19,8 +21,8 @@ from colmap_netvlad.photos.files import (
     photo_fingerprint,
     read_header,
 )
+from colmap_netvlad.retrieval.options import RetrievalOptions
 from colmap_netvlad.runtime.errors import InputError
-from colmap_netvlad.runtime.progress import console
 from colmap_netvlad.training.scenes import (
     ANNOTATION,
     Observations,
@@ -32,6 +34,8 @@ from colmap_netvlad.training.scenes import (
     symmetric,
 )
 from colmap_netvlad.training.tracks import tracks
+
+logger = logging.getLogger(__name__)
 
 if TYPE_CHECKING:
     import pycolmap
@@ -57,22 +61,20 @@ class AnnotateOptions:
 
     Attributes:
         method: retrieval method that chooses the pairs to match; the paper's is "bow".
-        k: partners retrieved for each image.
+        retrieval: k and what else the method takes.
         output: where annotations and working files go, one folder a scene; default: beside
             each scene's photos.
         databases: folder of matched COLMAP databases, `<scene>.db`; a scene found there is
             neither extracted nor matched again (its database is copied, never opened itself).
         mapper: name of the mapping method, or `NO_MAPPER`: tracks of verified matches stand for
             3D points. That is fast and lacks poses and the filter of a reconstruction.
-        seed: of retrieval and mapping.
     """
 
     method: str = "bow"
-    k: int = 30
+    retrieval: RetrievalOptions = RetrievalOptions()
     output: Path | None = None
     databases: Path | None = None
     mapper: str = "incremental"
-    seed: int = 0
 
 
 @dataclass
@@ -131,7 +133,7 @@ def annotate(datasets: Sequence[Path], options: AnnotateOptions) -> AnnotateRepo
         known = ", ".join((*MAPPERS, NO_MAPPER))
         raise InputError(f"No mapper is called {options.mapper!r}: there are {known}.")
     for folder in find_scenes(datasets):
-        console.print(f"Scene {folder.name}", highlight=False)
+        logger.info("Scene %s", folder.name)
         try:
             scene = annotate_scene(folder, options)
             check_disjoint([*report.scenes, scene])
@@ -155,7 +157,7 @@ def annotate_scene(folder: SceneFolder, options: AnnotateOptions) -> Scene:
         scene = load_annotation(path)
         if scene.images.resolve() != folder.images.resolve():
             raise InputError(
-                f"{path} is the annotation of other photos ({scene.images}); give another --output."
+                f"{path} is the annotation of other photos ({scene.images}); give another `output`."
             )
         if _is_current(scene, photos):
             return scene
@@ -305,15 +307,12 @@ def _matched_database(folder: SceneFolder, database: Path, options: AnnotateOpti
     from colmap_netvlad.matching.run import match_pairs
     from colmap_netvlad.pairs.union import union_of_top
     from colmap_netvlad.project import Project
-    from colmap_netvlad.retrieval.options import RetrievalOptions, check_k
-    from colmap_netvlad.retrieval.rank import rank
+    from colmap_netvlad.retrieval.rank import rank_project
 
     extract_features(folder.images, database)
-    with open_database(database) as opened:
-        k = check_k(options.k, len(opened.images()))
-    project = Project(database, folder.images)
-    ranking = rank(project, options.method, RetrievalOptions(k=k, seed=options.seed))
-    match_pairs(database, [(pair.name1, pair.name2) for pair in union_of_top(ranking, k)])
+    ranking = rank_project(Project(database, folder.images), options.method, options.retrieval)
+    pairs = union_of_top(ranking, options.retrieval.k)
+    match_pairs(database, [(pair.name1, pair.name2) for pair in pairs])
     return options.method
 
 
@@ -323,7 +322,9 @@ def _map(
     from colmap_netvlad.mapping import MAPPERS
     from colmap_netvlad.mapping.options import MappingOptions
 
-    return MAPPERS[options.mapper](database, images, output, MappingOptions(seed=options.seed))
+    return MAPPERS[options.mapper](
+        database, images, output, MappingOptions(seed=options.retrieval.seed)
+    )
 
 
 def _images_of(model: pycolmap.Reconstruction, row_of: dict[str, int]) -> dict[int, int]:

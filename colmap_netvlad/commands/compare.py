@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from colmap_netvlad import metrics
-from colmap_netvlad.compare import pool
-from colmap_netvlad.compare.evidence import Evidence
-from colmap_netvlad.compare.figures import FULL_RANKING, Candidate, compute_figures, gather_evidence
-from colmap_netvlad.compare.models import kept_figures, reconstruct_once
-from colmap_netvlad.compare.result import Comparison, ModelFigures, write_json
-from colmap_netvlad.compare.workspace import ProjectFacts, Workspace, open_workspace, read_facts
+from colmap_netvlad.comparison import pool
+from colmap_netvlad.comparison.evidence import Evidence
+from colmap_netvlad.comparison.figures import (
+    FULL_RANKING,
+    Candidate,
+    compute_figures,
+    gather_evidence,
+)
+from colmap_netvlad.comparison.models import kept_figures, reconstruct_once
+from colmap_netvlad.comparison.result import Comparison, ModelFigures, write_json
+from colmap_netvlad.comparison.workspace import Workspace, check_comparable, open_workspace
+from colmap_netvlad.flight import Flight, open_flight
 from colmap_netvlad.graph.pair import Pair, as_pair
 from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.matching.run import MatchOptions
@@ -22,9 +29,10 @@ from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval.methods import deep, find_method
 from colmap_netvlad.retrieval.options import RetrievalOptions, check_k
 from colmap_netvlad.retrieval.rank import rank
-from colmap_netvlad.runtime import progress
 from colmap_netvlad.runtime.errors import InputError
 from colmap_netvlad.runtime.files import write_atomically
+
+logger = logging.getLogger(__name__)
 
 ASK_ABOVE = 600.0
 """Exhaustive matching that is estimated to take longer than this, s, is asked about first."""
@@ -40,17 +48,17 @@ class CompareOptions:
     """What a user chooses about a comparison.
 
     Attributes:
-        ks: numbers of partners to compare; clamped to the number of other images.
+        k: numbers of partners to compare; clamped to the number of other images.
         output: the comparison's folder; None: `<database>-compare` beside the database.
         reconstruct: whether each method's model is made; one made earlier is shown in any case.
-        reconstruct_k: the number of partners the models are made from, one of `ks`; None: the
+        reconstruct_k: the number of partners the models are made from, one of `k`; None: the
             largest.
         retrieval: device, vocabulary tree; its k and seed are set from here.
         seed: of every method, of verification and of mapping.
         matching, mapping: their other options.
     """
 
-    ks: tuple[int, ...] = (30,)
+    k: tuple[int, ...] = (30,)
     output: Path | None = None
     reconstruct: bool = True
     reconstruct_k: int | None = None
@@ -60,12 +68,29 @@ class CompareOptions:
     mapping: MappingOptions = field(default_factory=MappingOptions)
 
 
+@dataclass(frozen=True)
+class CompareReport:
+    """The result of `compare`.
+
+    Attributes:
+        comparison: all figures.
+        page, json, csv: where they stand: the report page, and the figures as tables.
+    """
+
+    comparison: Comparison
+    page: Path
+    json: Path
+    csv: Path
+
+
 def compare(
     project: Project,
     methods: Sequence[str],
     options: CompareOptions = CompareOptions(),
     confirm: Confirm = lambda question: False,
-) -> tuple[Comparison, Workspace]:
+    *,
+    k: Sequence[int] = (),
+) -> CompareReport:
     """Compare retrieval methods on one project, and write the report.
 
     The user's database is read only. Everything is kept in the comparison's folder: a killed run
@@ -75,54 +100,50 @@ def compare(
         methods: names of the table of methods, or checkpoints by path.
         confirm: asked with one question before an exhaustive matching that takes long.
 
+        k: shorthand for `options.k`.
+
     Returns:
-        The figures, and the folder with the page and tables. A method that fails is in
+        The figures, and where the page and the tables are. A method that fails is in
         `Comparison.incomplete`; the others are complete.
 
     Raises:
         InputError: no method, an unknown one, no features, k out of range, a folder that is not
             this project's comparison, or exhaustive matching that was not confirmed.
     """
+    if k:
+        options = replace(options, k=tuple(k))
     if not methods:
-        raise InputError("No method to compare; name some with --methods bow,vlad,...")
+        raise InputError("No method to compare; name some in `methods`, bow and vlad for example.")
     texts = [_stable_text(text) for text in methods]
-    facts = read_facts(project.database)
-    ks = _checked_ks(options, len(facts.names))
+    with open_flight(project) as flight:
+        return _compare(flight, texts, options, confirm)
+
+
+def _compare(
+    flight: Flight, texts: Sequence[str], options: CompareOptions, confirm: Confirm
+) -> CompareReport:
+    check_comparable(flight)
+    project = flight.project
+    ks = _checked_ks(options, len(flight.names))
     folder = options.output or project.folder / f"{project.database.stem}-compare"
-    workspace = open_workspace(folder, project.database, facts)
+    workspace = open_workspace(folder, flight)
     candidates = _candidates(workspace.add_methods(texts))
     matching = replace(options.matching, seed=options.seed)
     if any(not candidate.ranks for candidate in candidates):
-        _check_cost(workspace, facts, matching, confirm)
+        _check_cost(workspace, flight, matching, confirm)
     for candidate in candidates:
-        _rank(candidate, project, workspace, facts, ks, options)
+        _rank(candidate, flight, workspace, ks, options)
     pairs = {k: {c.name: _pairs(c, k) for c in candidates if c.ranking} for k in ks}
     matched_now = pool.match_once(workspace, pairs[ks[-1]], matching)
     _say_matched(pairs[ks[-1]], matched_now)
-    k = ks[-1] if options.reconstruct_k is None else _clamped(options.reconstruct_k, facts)
+    k = check_k(options.reconstruct_k or ks[-1], len(flight.names))
     for candidate in candidates:
         if candidate.ranking:
             _map(candidate, workspace, project.images, pairs[k][candidate.name], k, options)
-    evidence = gather_evidence(project, workspace, facts, candidates, pairs[ks[-1]])
-    comparison = compute_figures(
-        project, workspace, facts, candidates, pairs, evidence, options.seed
-    )
+    evidence = gather_evidence(flight, workspace, candidates, pairs[ks[-1]])
+    comparison = compute_figures(flight, workspace, candidates, pairs, evidence, options.seed)
     write_report(workspace, comparison, evidence)
-    return comparison, workspace
-
-
-def parse_ks(text: str) -> tuple[int, ...]:
-    """Read `10,20,30`.
-
-    Raises:
-        InputError: it is not a list of whole numbers.
-    """
-    try:
-        return tuple(int(part) for part in text.split(",") if part.strip())
-    except ValueError:
-        raise InputError(
-            f"--k is {text!r}; it is a whole number or several with commas, as in --k 10,20,30."
-        ) from None
+    return CompareReport(comparison, workspace.html, workspace.json, workspace.csv)
 
 
 def write_report(workspace: Workspace, comparison: Comparison, evidence: Evidence) -> None:
@@ -136,19 +157,15 @@ def write_report(workspace: Workspace, comparison: Comparison, evidence: Evidenc
 
 
 def _checked_ks(options: CompareOptions, images: int) -> tuple[int, ...]:
-    if not options.ks:
-        raise InputError("--k names no number of partners; give one or several: --k 10,20,30.")
-    ks = tuple(sorted({check_k(k, images) for k in options.ks}))
+    if not options.k:
+        raise InputError("`k` names no number of partners; give one or several.")
+    ks = tuple(sorted({check_k(k, images) for k in options.k}))
     wanted = options.reconstruct_k
     if wanted is not None and check_k(wanted, images) not in ks:
         raise InputError(
-            f"--reconstruct-k is {wanted}, which is not one of --k {', '.join(map(str, ks))}."
+            f"`reconstruct_k` is {wanted}, which is not one of `k`: {', '.join(map(str, ks))}."
         )
     return ks
-
-
-def _clamped(k: int, facts: ProjectFacts) -> int:
-    return check_k(k, len(facts.names))
 
 
 def _stable_text(text: str) -> str:
@@ -174,44 +191,43 @@ def _candidates(texts: Sequence[str]) -> list[Candidate]:
 
 
 def _check_cost(
-    workspace: Workspace, facts: ProjectFacts, options: MatchOptions, confirm: Confirm
+    workspace: Workspace, flight: Flight, options: MatchOptions, confirm: Confirm
 ) -> None:
     """Say what exhaustive matching will cost, and ask where that is long."""
-    possible = len(facts.names) * (len(facts.names) - 1) // 2
+    possible = len(flight.names) * (len(flight.names) - 1) // 2
     left = possible - len(pool.matched(workspace))
     if not left:
         return
-    each = pool.measure_cost(workspace, facts.names, options)
+    each = pool.measure_cost(workspace, flight.names, options)
     minutes = each * left / 60
     cost = (
         f"Exhaustive matching: {left:,} pairs, about {minutes:.1f} min "
         f"({each:.3f} s a pair, measured on {min(pool.SAMPLE, possible)})."
     )
-    progress.console.print(cost, highlight=False)
+    logger.info(cost)
     if minutes * 60 > ASK_ABOVE and not confirm(f"{cost} Go on?"):
-        raise InputError(f"{cost} Say --yes, or leave the method exhaustive out.")
+        raise InputError(f"{cost} Say so with `confirm`, or leave the method exhaustive out.")
 
 
 def _rank(
     candidate: Candidate,
-    project: Project,
+    flight: Flight,
     workspace: Workspace,
-    facts: ProjectFacts,
     ks: tuple[int, ...],
     options: CompareOptions,
 ) -> None:
     if candidate.failed:
         return
-    count = len(facts.names)
+    count = len(flight.names)
     depth = count - 1 if count <= FULL_RANKING else ks[-1]
     retrieval = replace(options.retrieval, k=depth, seed=options.seed)
     try:
         key = _ranking_key(candidate.text, retrieval)
         kept = workspace.load_ranking(key)
         if kept is None:
-            progress.console.print(f"Ranking by {candidate.name}", highlight=False)
+            logger.info("Ranking by %s", candidate.name)
             start = time.perf_counter()
-            ranking = rank(project, candidate.text, retrieval).top(depth)
+            ranking = rank(flight, candidate.text, retrieval).top(depth)
             seen = time.perf_counter() - start
             kept = ranking, metrics.efficiency(ranking) > STOLEN_TIME * seen
             workspace.save_ranking(key, *kept)
@@ -224,7 +240,7 @@ def _ranking_key(text: str, options: RetrievalOptions) -> str:
     """Everything a ranking of the same features depends on."""
     method = find_method(text)
     key = f"{text}-k{options.k}-seed{options.seed}"
-    if options.vocab_tree is not None and method.name == "bow":
+    if options.vocab_tree is not None:
         key += f"-{options.vocab_tree.resolve()}-{options.vocab_tree.stat().st_mtime_ns}"
     if method.model is not None:
         key += f"-{deep.model_fingerprint(deep.checkpoint_file(method.model))}"
@@ -241,10 +257,9 @@ def _pairs(candidate: Candidate, k: int) -> set[Pair]:
 def _say_matched(pairs: Mapping[str, set[Pair]], now: int) -> None:
     distinct = len(set().union(*pairs.values()))
     asked = sum(map(len, pairs.values()))
-    progress.console.print(
+    logger.info(
         f"Matched each distinct pair once: {distinct:,} pairs for {asked:,} asked by "
-        f"{len(pairs)} methods, {now:,} of them now.",
-        highlight=False,
+        f"{len(pairs)} methods, {now:,} of them now."
     )
 
 
@@ -261,7 +276,7 @@ def _map(
     candidate.model = kept_figures(folder, pairs, k, mapping)
     if candidate.model or not options.reconstruct:
         return
-    progress.console.print(f"Mapping {candidate.name}", highlight=False)
+    logger.info("Mapping %s", candidate.name)
     try:
         candidate.model = reconstruct_once(workspace.union, images, folder, pairs, k, mapping)
     except Exception as fault:  # whatever stops one method leaves the others

@@ -11,15 +11,15 @@ from colmap_netvlad.colmap.features import FeatureOptions, extract_features
 from colmap_netvlad.commands.pairs import make_pairs, summary
 from colmap_netvlad.commands.reconstruct import (
     ReconstructOptions,
+    ReconstructReport,
     reconstruct,
     report_lines,
-    report_table,
 )
 from colmap_netvlad.demo.check import TruthCheck, check_against_truth
 from colmap_netvlad.demo.picture import draw_result
 from colmap_netvlad.demo.render import (
-    Flight,
     FlightOptions,
+    RenderedFlight,
     flight_exists,
     read_flight,
     render_flight,
@@ -46,7 +46,7 @@ def run_demo(
     folder: Path,
     method: str,
     flight_options: FlightOptions = DEMO_FLIGHT,
-    say: Callable[[object], None] = print,
+    say: Callable[[str | ReconstructReport], None] = lambda item: None,
 ) -> TruthCheck:
     """Run the whole pipeline on a rendered flight in `folder` and compare it with the truth.
 
@@ -56,7 +56,7 @@ def run_demo(
         folder: new or empty, or that of an earlier demo of the same options.
         method: retrieval method.
         flight_options: the flight to render.
-        say: takes each line and table of the report.
+        say: is told each line of the report, and the report of the reconstruction.
 
     Raises:
         InputError: `folder` holds something else or cannot be written; as the stages do.
@@ -82,7 +82,7 @@ def run_demo(
         mapping=MappingOptions(seed=seed), matching=MatchOptions(seed=seed)
     )
     report = reconstruct(project, options=options)
-    say(report_table(report))
+    say(report)
     for line in report_lines(report):
         say(f"   {line}")
 
@@ -94,13 +94,13 @@ def run_demo(
     return check
 
 
-def _flight(folder: Path, options: FlightOptions) -> Flight:
+def _flight(folder: Path, options: FlightOptions) -> RenderedFlight:
     if flight_exists(folder, options):
         flight = read_flight(folder)
         if all((flight.images / name).is_file() for name in flight.names):
             return flight
     elif folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(f"{folder} holds something else; name a new folder with --output.")
+        raise InputError(f"{folder} holds something else; name a new folder with `output`.")
     return render_flight(folder, options)
 
 

@@ -85,6 +85,12 @@ def export(
     return ExportReport(output, files, name)
 
 
+def report_lines(report: ExportReport) -> list[str]:
+    """Return what `colmap-netvlad export` prints."""
+    system = "" if report.crs is None else f"; CSV, LAS and shots in {report.crs}"
+    return [*report.files, f"{len(report.files)} files in {report.output}{system}."]
+
+
 def _write_plain(model: pycolmap.Reconstruction, formats: Sequence[str], target: Path) -> None:
     if "ply" in formats:
         model.export_PLY(target / "points.ply")
@@ -97,6 +103,6 @@ def _projected(name: str) -> CRS:
     crs = read_crs(name)
     if not crs.is_projected:
         raise InputError(
-            f"{crs.name} is in degrees; name a projected system with --crs, EPSG:32632 for example."
+            f"{crs.name} is in degrees; name a projected system as `crs`, EPSG:32632 for example."
         )
     return crs

@@ -7,6 +7,7 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pycolmap
@@ -42,6 +43,24 @@ class ControlFile:
     def read(self, photos: Sequence[str]) -> ControlList:
         """Read it for a project's photos (see `geo.gcp.read_control`)."""
         return read_control(self.path, photos, self.check)
+
+
+@dataclass(frozen=True)
+class WorldOptions:
+    """How models that have just been mapped are brought into the world.
+
+    Attributes:
+        georegister: auto (where positions are known), off, require.
+        use_gps: adjust with the positions as priors.
+        gps_std: standard deviation of positions, m horizontal and vertical, for all photos; None:
+            what each photo states, else `geo.places.DEFAULT_DEVIATIONS`.
+        gcp: ground points, which place the models and are held in a last adjustment.
+    """
+
+    georegister: Literal["auto", "off", "require"] = "auto"
+    use_gps: bool = False
+    gps_std: tuple[float, float] | None = None
+    gcp: ControlFile | None = None
 
 
 MODEL_FILES = ("images.bin", "images.txt")
@@ -114,7 +133,11 @@ def georegister(
         asked = " and ".join(str(path) for path in (database, images) if path is not None)
         raise InputError(
             f"No position is known of any of the {len(names)} photos "
-            + (f"(looked in {asked})" if asked else "(name the photos with --images, or --db)")
+            + (
+                f"(looked in {asked})"
+                if asked
+                else "(name the photos' folder as `images`, or a `database`)"
+            )
             + ", so the model cannot be georegistered."
             + "".join(f" {note}" for note in places.notes)
         )
@@ -131,6 +154,12 @@ def georegister(
             if one.georeference is None:
                 (temporary / one.name).rmdir()
     return GeoregisterReport(output, placed, places.notes)
+
+
+def report_lines(report: GeoregisterReport) -> list[str]:
+    """Return what `colmap-netvlad georegister` prints."""
+    lines = [f"{placed.name}: {line}" for placed in report.models for line in placed.lines()]
+    return [*lines, *report.notes, f"Written to {report.output}."]
 
 
 def georegister_in_place(
@@ -264,7 +293,7 @@ def find_models(sparse: Path) -> list[Path]:
         if found:
             return sorted(found, key=lambda path: int(path.name))
     raise InputError(
-        f"{sparse} holds no COLMAP model (cameras, images, points3D); name one with --sparse."
+        f"{sparse} holds no COLMAP model (cameras, images, points3D); name one as `sparse`."
     )
 
 

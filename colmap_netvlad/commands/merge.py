@@ -28,7 +28,7 @@ from colmap_netvlad.mapping.together import join_and_adjust
 from colmap_netvlad.matching.run import MatchOptions, MatchReport, match_pairs
 from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval.options import RetrievalOptions
-from colmap_netvlad.retrieval.rank import rank
+from colmap_netvlad.retrieval.rank import rank_project
 from colmap_netvlad.runtime import progress, workers
 from colmap_netvlad.runtime.errors import InputError
 
@@ -42,15 +42,18 @@ class MergeOptions:
 
     Attributes:
         method: retrieval method.
-        retrieval: what it takes; its k is not used.
+        retrieval: what it takes, and the seed; its k is not used.
         across: partners of each image in other models that are matched.
-        seed: of matching, RANSAC and adjustment.
     """
 
     method: str = "hybrid"
     retrieval: RetrievalOptions = field(default_factory=RetrievalOptions)
     across: int = 10
-    seed: int = 0
+
+    @property
+    def seed(self) -> int:
+        """Of matching, RANSAC and adjustment."""
+        return self.retrieval.seed
 
 
 @dataclass(frozen=True)
@@ -100,7 +103,7 @@ def merge_models(
     """
     given = [(path, folder) for path in sparse for folder in find_models(path)]
     if len(given) < 2:
-        raise InputError("One model alone cannot be merged; name two or more with --sparse.")
+        raise InputError("One model alone cannot be merged; name two or more as `sparse`.")
     names = [str(folder) for _, folder in given]
     known = set(image_names(project.database))
     target = free_output(project.sparse) if output is None else output
@@ -173,8 +176,8 @@ def pairs_across(ranking: Ranking, homes: Sequence[set[str]], across: int) -> li
 
 
 def _ranking(project: Project, options: MergeOptions) -> Ranking:
-    depth = min(len(image_names(project.database)) - 1, max(DEPTH, options.across))
-    return rank(project, options.method, replace(options.retrieval, k=depth))
+    retrieval = replace(options.retrieval, k=options.across)
+    return rank_project(project, options.method, retrieval, max(DEPTH, options.across))
 
 
 def _in_database(

@@ -6,16 +6,17 @@ import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from colmap_netvlad.cache.ranking import Ranking
-from colmap_netvlad.cache.store import Store
-from colmap_netvlad.colmap.database import image_names, open_database
+from colmap_netvlad.flight import open_flight
 from colmap_netvlad.graph.components import component_names, components
 from colmap_netvlad.models.catalogue import CATALOGUE, DEFAULT
 from colmap_netvlad.pairs.connect import apart_lines, connecting_budget, connecting_pairs
 from colmap_netvlad.pairs.lists import FORMATS, read_pairs, write_pairs
 from colmap_netvlad.pairs.rules import (
     PartnerRules,
+    in_order,
     join_pairs,
     sequential_pairs,
     with_camera_quota,
@@ -24,9 +25,8 @@ from colmap_netvlad.pairs.rules import (
 from colmap_netvlad.pairs.union import ImagePair, union_of_top
 from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval.fusion import similarity_matrix
-from colmap_netvlad.retrieval.methods.hybrid import fusion_depth
-from colmap_netvlad.retrieval.options import COMPARED, RetrievalOptions, check_k
-from colmap_netvlad.retrieval.rank import rank
+from colmap_netvlad.retrieval.options import COMPARED, RetrievalOptions
+from colmap_netvlad.retrieval.rank import export_descriptors, rank
 from colmap_netvlad.runtime.errors import InputError
 
 NO_RULES = PartnerRules()
@@ -68,10 +68,13 @@ def make_pairs(
     output: Path | None = None,
     rules: PartnerRules = NO_RULES,
     connect: bool = True,
+    export: Path | None = None,
+    *,
+    k: int | None = None,
 ) -> PairsReport:
     """Retrieve each image's k nearest partners and write the union as a pairs list.
 
-    Never writes to the user's database. Descriptors, ranks and scores are kept in the project's
+    Never writes to the user's database. Descriptors and what was compared are kept in the project's
     cache, where the photo folder is remembered as well.
 
     Args:
@@ -84,6 +87,8 @@ def make_pairs(
             the same name ending in .csv.
         rules: cameras, sequences and pairs the user knows of; photos of one rig frame are never
             paired.
+        export: also write the method's global descriptors there, in hloc's HDF5 layout.
+        k: shorthand for `options.k`.
         connect: where the k nearest leave the images in several components, add the best pairs
             between these, at most `connecting_budget` of them.
 
@@ -91,87 +96,57 @@ def make_pairs(
         InputError: anything in the input a user can mend.
     """
     options = options or RetrievalOptions()
+    if k is not None:
+        options = replace(options, k=k)
     if format not in FORMATS:
         raise InputError(f"There is no format {format!r}; formats are {', '.join(FORMATS)}.")
     output = output or project.pairs.with_suffix(SUFFIXES[format])
     _protect(output, project)
     rules.check()
-    names = image_names(project.database)
-    extra = _extra_pairs(names, rules)
-    ranking = _rank_by_rules(project, method, options, rules)
-    pairs = join_pairs(union_of_top(ranking, ranking.depth), extra, names)
-    _remember(project, ranking)
-    found = len(pairs)
-    if connect:
-        pairs = _connect(project, method, options, ranking, pairs)
+    with open_flight(project) as flight:
+        extra = _extra_pairs(flight.names, rules)
+        ranking = rank(flight, method, options)
+        if export is not None:
+            export_descriptors(flight, method, options, export)
+        frames = [flight.frames.get(image.image_id) for image in flight.images]
+        cameras = [image.camera_id for image in flight.images]
+        names, has_features = flight.names, bool(flight.descriptors)
+    ranking = without_same_frame(ranking, frames)
+    depth = min(options.k, len(names) - 1)
+    chosen = with_camera_quota(ranking, cameras, depth, rules.other_cameras)
+    pairs = join_pairs(union_of_top(chosen, depth), extra, names)
+    links = _links(ranking, pairs) if connect else []
+    pairs = in_order([*pairs, *links], names)
     unwritable = write_pairs(output, pairs, format)
     colmap_list = None
     if unwritable:
         colmap_list, output = output, output.with_suffix(".csv")
         write_pairs(output, pairs, "csv")
-    with open_database(project.database) as database:
-        has_features = bool(database.descriptor_counts())
     return PairsReport(
-        ranking,
+        chosen,
         pairs,
         component_names(names, [(pair.name1, pair.name2) for pair in pairs]),
         output,
         colmap_list,
         unwritable,
         has_features,
-        len(pairs) - found,
+        len(links),
     )
 
 
-def _rank_by_rules(
-    project: Project, method: str, options: RetrievalOptions, rules: PartnerRules
-) -> Ranking:
-    """Rank, and choose each image's k partners with regard to rig frames and cameras."""
-    with open_database(project.database) as database:
-        images = database.images()
-        frames = database.frames()
-    k = check_k(options.k, len(images))
-    is_rig = len(set(frames.values())) < len(frames)
-    if not is_rig and not rules.other_cameras:
-        ranking = rank(project, method, options)
-        return ranking if ranking.method == "exhaustive" else ranking.top(k)
-    # What the rules take out must be replaced from further down.
-    ranking = _rank_deeply(project, method, options)
-    cameras = [image.camera_id for image in images]
-    return with_camera_quota(ranking, cameras, k, rules.other_cameras)
-
-
-def _rank_deeply(project: Project, method: str, options: RetrievalOptions) -> Ranking:
-    """Rank further down than k, without partners of an image's own rig frame."""
-    with open_database(project.database) as database:
-        images = database.images()
-        frames = database.frames()
-    deeper = replace(options, k=min(fusion_depth(options.k), len(images) - 1))
-    ranking = rank(project, method, deeper)
-    return without_same_frame(ranking, [frames.get(image.image_id) for image in images])
-
-
-def _connect(
-    project: Project,
-    method: str,
-    options: RetrievalOptions,
-    ranking: Ranking,
-    pairs: list[ImagePair],
-) -> list[ImagePair]:
-    """Return the pairs with the best ones between their components added, if there are several."""
+def _links(ranking: Ranking, pairs: Sequence[ImagePair]) -> list[ImagePair]:
+    """Return the best pairs between the components that pairs leave apart, if there are several."""
     names = ranking.names
     index = {name: i for i, name in enumerate(names)}
     chosen = [(index[pair.name1], index[pair.name2]) for pair in pairs]
     component = components(len(names), chosen)
-    if ranking.method == "exhaustive" or not component.any():
-        return pairs
-    deep = _rank_deeply(project, method, options)
-    candidates = {(p.name1, p.name2): p for p in union_of_top(deep, deep.depth)}
+    if ranking.every_pair or not component.any():
+        return []
+    candidates = {(p.name1, p.name2): p for p in union_of_top(ranking, ranking.depth)}
     added = connecting_pairs(
-        similarity_matrix(deep), component, chosen, names, connecting_budget(len(pairs))
+        similarity_matrix(ranking), component, chosen, names, connecting_budget(len(pairs))
     )
-    links = [candidates[names[i], names[j]] for i, j in added]
-    return sorted([*pairs, *links], key=lambda pair: (index[pair.name1], index[pair.name2]))
+    return [candidates[names[i], names[j]] for i, j in added]
 
 
 def _extra_pairs(names: Sequence[str], rules: PartnerRules) -> list[tuple[str, str]]:
@@ -179,6 +154,25 @@ def _extra_pairs(names: Sequence[str], rules: PartnerRules) -> list[tuple[str, s
     if rules.own_pairs is not None:
         extra += read_pairs(rules.own_pairs, names)
     return extra
+
+
+def as_json(report: PairsReport) -> dict[str, Any]:
+    """Return what `colmap-netvlad pairs --json` prints."""
+    ranking = report.ranking
+    return {
+        "images": len(ranking.names),
+        "method": ranking.method,
+        "k": ranking.depth,
+        "pairs": len(report.pairs),
+        "connecting": report.connecting,
+        "components": report.components,
+        "seconds_describe": ranking.seconds_describe,
+        "seconds_search": ranking.seconds_search,
+        "notes": ranking.notes,
+        "left_out": [{"image": name, "reason": reason} for name, reason in ranking.left_out],
+        "output": report.output,
+        "colmap_list": report.colmap_list,
+    }
 
 
 def summary(project: Project, report: PairsReport) -> list[str]:
@@ -202,7 +196,7 @@ def summary(project: Project, report: PairsReport) -> list[str]:
         )
     if report.has_features and ranking.method in CATALOGUE and len(ranking.names) > COMPARED + 1:
         lines.append(
-            "Better       --method hybrid looks for candidates by the database's SIFT features "
+            "Better       The method hybrid looks for candidates by the database's SIFT features "
             "too, and by GPS where there is any, for little time"
         )
     return [*lines, f"Next         {_next_command(project, report)}"]
@@ -213,13 +207,13 @@ def _component_lines(report: PairsReport) -> list[str]:
     if report.connecting:
         lines.append(
             f"Connecting   {report.connecting} pairs added between components that each image's "
-            f"{report.ranking.depth} nearest leave apart (--no-connect: none)"
+            f"{report.ranking.depth} nearest leave apart (`connect`)"
         )
     if len(groups) == 1:
         return [*lines, "Components   1: the pairs connect all images"]
     return [
         *lines,
-        f"Components   {len(groups)}: the pairs do not connect all images; a larger --k may. "
+        f"Components   {len(groups)}: the pairs do not connect all images; a larger `k` may. "
         f"The largest has {len(groups[0])} images; apart from it are:",
         *(f"             {line}" for line in apart_lines(groups)),
     ]
@@ -235,13 +229,4 @@ def _next_command(project: Project, report: PairsReport) -> str:
 def _protect(output: Path, project: Project) -> None:
     for precious in (project.database, project.cache):
         if output.resolve() == precious.resolve():
-            raise InputError(f"--output would overwrite {precious}; name another file.")
-
-
-def _remember(project: Project, ranking: Ranking) -> None:
-    """Keep the ranking and the photo folder, which as part of the workspace moves with it."""
-    with Store(project.cache) as store:
-        if project.images is not None:
-            store.remember_images(project.images)
-        if ranking.method != "exhaustive":  # all pairs in order say nothing worth keeping
-            store.save_ranking(ranking)
+            raise InputError(f"`output` would overwrite {precious}; name another file.")

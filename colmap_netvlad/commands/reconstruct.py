@@ -3,38 +3,40 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any
 
 import numpy as np
-from rich.table import Table
 
-from colmap_netvlad.colmap.database import copy_database, image_names, open_database
+from colmap_netvlad.colmap.database import image_names
 from colmap_netvlad.commands.georegister import (
-    ControlFile,
     Placed,
+    WorldOptions,
     georegister_in_place,
     places_for,
 )
+from colmap_netvlad.commands.match import (
+    MatchingReport,
+    PairsOrList,
+    RoundsOptions,
+    match,
+    view_graph_lines,
+)
+from colmap_netvlad.commands.match import as_json as match_json
 from colmap_netvlad.geo.align import MIN_PLACES
 from colmap_netvlad.geo.gcp import ControlList
 from colmap_netvlad.geo.places import Places, find_deviations, find_places
-from colmap_netvlad.graph.verified import verified_components
 from colmap_netvlad.mapping import MAPPERS, WITH_PRIORS
 from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.mapping.output import free_output
 from colmap_netvlad.mapping.priors import PositionPriors
 from colmap_netvlad.mapping.summary import ModelSummary, combine, registered_names, summarize
-from colmap_netvlad.matching.run import MatchOptions, MatchReport, match_pairs
-from colmap_netvlad.pairs.connect import apart_lines
-from colmap_netvlad.pairs.lists import read_pairs
+from colmap_netvlad.matching.rounds import rounds_lines
+from colmap_netvlad.matching.run import MatchOptions
 from colmap_netvlad.project import Project
 from colmap_netvlad.runtime.errors import InputError
-
-MISSING_SHOWN = 10
-"""Names of unregistered images that are printed."""
+from colmap_netvlad.runtime.sequences import listed
 
 
 @dataclass(frozen=True)
@@ -45,21 +47,13 @@ class ReconstructOptions:
         mapper: name in `mapping.MAPPERS`.
         mapping: what the mapper is told.
         matching: how pairs are matched.
-        georegister: whether models are brought into the world: auto (where positions are known),
-            off, require.
-        use_gps: adjust with the positions as priors.
-        gps_deviation: standard deviation of positions, m horizontal and vertical, for all
-            photos; None: what each photo states, else `geo.places.DEFAULT_DEVIATIONS`.
-        gcp: ground points, which place the models and are held in a last adjustment.
+        world: how models are brought into the world.
     """
 
-    mapper: str = "incremental"
+    mapper: str = "auto"
     mapping: MappingOptions = MappingOptions()
     matching: MatchOptions = MatchOptions()
-    georegister: Literal["auto", "off", "require"] = "auto"
-    use_gps: bool = False
-    gps_deviation: tuple[float, float] | None = None
-    gcp: ControlFile | None = None
+    world: WorldOptions = WorldOptions()
 
 
 @dataclass(frozen=True)
@@ -69,83 +63,65 @@ class ReconstructReport:
     Attributes:
         output: folder of the models.
         images: images in the database.
-        matches: report of the matching.
+        matching: report of the matching.
         models: figures of each model, in the order of their folders.
         total: figures of all models together.
         missing: names of the images without a pose in any model.
         seconds: duration by stage, s.
-        components: image names of each component of the verified view graph, largest first.
         placed: where each model is in the world; empty where that was not asked or no position
             is known.
-        notes: what was put aside among the positions.
+        notes: how good the positions are taken to be, and what was put aside among them.
     """
 
     output: Path
     images: int
-    matches: MatchReport
+    matching: MatchingReport
     models: list[ModelSummary]
     total: ModelSummary
     missing: list[str] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
-    components: list[list[str]] = field(default_factory=list)
     placed: list[Placed] = field(default_factory=list)
     notes: tuple[str, ...] = ()
 
 
 def reconstruct(
     project: Project,
-    pairs: Path | None = None,
+    pairs: PairsOrList = None,
     output: Path | None = None,
     options: ReconstructOptions = ReconstructOptions(),
+    rounds: RoundsOptions | None = None,
 ) -> ReconstructReport:
-    """Match the pairs of a list, map, and write the sparse models.
+    """Match pairs, map, and write the sparse models.
 
     It writes matches into the project's database, where COLMAP keeps them. Pairs matched before
     are not matched again.
 
     Args:
         project: database and photos.
-        pairs: the pairs list; default: `pairs.txt` beside the database.
+        pairs: pairs of `make_pairs`, a pairs list or pairs of names; default: `pairs.txt` beside
+            the database.
         output: folder of the models; default: `sparse` beside the database, or `sparse-2`,
             `sparse-3`, ... where there are models already.
         options: mapper, seeds, limits.
+        rounds: choose pairs in rounds instead.
 
     Raises:
-        InputError: no pairs list, no features, an unknown mapper, or no model at all.
+        InputError: no pairs, no features, an unknown mapper, no pair that could be verified, or
+            no model at all.
     """
-    check_mapper(options.mapper, use_gps=options.use_gps)
-    with open_database(project.database) as colmap:
-        names = [row.name for row in colmap.images()]
-    chosen = read_pairs(_existing(pairs or project.pairs), names)
-    if not chosen:
-        raise InputError(f"{pairs or project.pairs} lists no pairs; run `colmap-netvlad pairs`.")
-    matches = match_pairs(project.database, chosen, options.matching)
-    return map_and_report(project, matches, output, options)
-
-
-def map_and_report(
-    project: Project,
-    matches: MatchReport,
-    output: Path | None = None,
-    options: ReconstructOptions = ReconstructOptions(),
-) -> ReconstructReport:
-    """Map a database whose pairs are matched, and sum up.
-
-    Raises:
-        InputError: no pair was verified, or no model came out of it.
-    """
-    check_mapper(options.mapper, use_gps=options.use_gps)
+    check_mapper(options.mapper, use_gps=options.world.use_gps)
+    control, places = _known_places(project, options.world)
+    matching = match(project, pairs, rounds, options.matching)
+    matches = matching.matches
     if not matches.verified:
         raise InputError(
             f"None of the {matches.requested} pairs could be verified, so there is nothing to "
             "reconstruct; the photos may not overlap, or the pairs list be of other photos."
         )
-    control = None if options.gcp is None else options.gcp.read(image_names(project.database))
-    places = _places(project, control, options)
-    mapping = options.mapping
-    priors_note: tuple[str, ...] = ()
-    if options.use_gps and places is not None:
-        mapping, priors_note = _with_priors(project, places, options)
+    mapping, notes = options.mapping, () if places is None else places.notes
+    if options.world.use_gps and places is not None:
+        mapping, note = _with_priors(project, places, options)
+        notes = (note, *notes)
     target = free_output(output or project.sparse)
     start = time.monotonic()
     models = MAPPERS[options.mapper](project.database, project.images, target, mapping)
@@ -153,88 +129,67 @@ def map_and_report(
     if not models:
         raise InputError(
             f"No model came out of {matches.verified} verified pairs: none has enough inliers and "
-            "baseline to start from. More pairs (--k) or more overlap may help."
+            "baseline to start from. More pairs (`k`) or more overlap may help."
         )
-    placed = (
-        []
-        if places is None
-        else georegister_in_place(
-            target, places, control, adjusted=options.use_gps, seed=options.mapping.seed
+    placed = []
+    if places is not None:
+        placed = georegister_in_place(
+            target, places, control, adjusted=options.world.use_gps, seed=mapping.seed
         )
-    )
     registered = registered_names(models)
     names = image_names(project.database)
     return ReconstructReport(
         output=target,
         images=len(names),
-        matches=matches,
+        matching=matching,
         models=[summarize(model) for model in models],
         total=combine(models),
         missing=[name for name in names if name not in registered],
         seconds=seconds,
-        components=verified_components(project.database),
         placed=placed,
-        notes=(*priors_note, *(() if places is None else places.notes)),
+        notes=notes,
     )
 
 
-def _places(
-    project: Project, control: ControlList | None, options: ReconstructOptions
-) -> Places | None:
-    """Return the known positions, or None where models stay where they are.
+def _known_places(
+    project: Project, world: WorldOptions
+) -> tuple[ControlList | None, Places | None]:
+    """Return ground points and known positions; None for both where models stay where they are.
 
     Raises:
-        InputError: a place in the world is required, and too few positions are known.
+        InputError: a place in the world is required, and too few positions are known; or the
+            ground points cannot be used.
     """
-    if options.georegister == "off" and not options.use_gps and control is None:
-        return None
-    places = find_places(image_names(project.database), project.database, project.images)
-    places = places_for(places, control)
+    names = image_names(project.database)
+    control = None if world.gcp is None else world.gcp.read(names)
+    if world.georegister == "off" and not world.use_gps and control is None:
+        return None, None
+    places = places_for(find_places(names, project.database, project.images), control)
     if places.known >= MIN_PLACES:
-        return places
-    if options.use_gps or (options.georegister == "require" and control is None):
-        asked = "--use-gps" if options.use_gps else "--georegister require"
+        return control, places
+    if world.use_gps or (world.georegister == "require" and control is None):
+        asked = "`use_gps`" if world.use_gps else "`georegister` require"
         raise InputError(
-            f"{places.known} of {len(places.names)} photos have a usable position, and "
-            f"{asked} needs {MIN_PLACES}; nothing was mapped."
-            + "".join(f" {note}" for note in places.notes)
+            f"{places.known} of {len(names)} photos have a usable position, and {asked} needs "
+            f"{MIN_PLACES}; nothing was mapped." + "".join(f" {note}" for note in places.notes)
         )
-    return None if control is None else places
+    return (None, None) if control is None else (control, places)
 
 
 def _with_priors(
     project: Project, places: Places, options: ReconstructOptions
-) -> tuple[MappingOptions, tuple[str, ...]]:
+) -> tuple[MappingOptions, str]:
     """Return what the mapper is told with positions as priors, and a sentence on their accuracy."""
-    deviations, stating = find_deviations(
-        places.names, project.database, project.images, options.gps_deviation
-    )
+    given = options.world.gps_std
+    deviations, stating = find_deviations(places.names, project.database, project.images, given)
     priors = PositionPriors(places.names, places.metres, deviations)
-    if options.gps_deviation is not None:
-        source = "as given"
-    else:
-        source = f"{stating:,} state their own, the others have the default"
+    source = f"{stating:,} photos state their own, the others have the default"
     east, _, up = np.median(deviations, axis=0).tolist()
     note = (
         f"Adjusted with {places.known:,} positions; standard deviation {east:g} m horizontally, "
-        f"{up:g} m vertically in the median ({source})."
+        f"{up:g} m vertically in the median ({'as given' if given else source})."
     )
-    return replace(options.mapping, priors=priors), (note,)
-
-
-def working_copy(project: Project) -> Project:
-    """Return the project on a copy of its database, `<name>.copy.db` beside it.
-
-    A copy of the same images and features is taken up again, with the matches in it; any other
-    is replaced.
-
-    Raises:
-        InputError: the copy cannot be written.
-    """
-    copy = project.database.with_suffix(".copy.db")
-    if not (copy.exists() and _features(copy) == _features(project.database)):
-        copy_database(project.database, copy, matches=True)
-    return Project(copy, project.images)
+    return replace(options.mapping, priors=priors), note
 
 
 def check_mapper(name: str, *, use_gps: bool = False) -> None:
@@ -243,42 +198,24 @@ def check_mapper(name: str, *, use_gps: bool = False) -> None:
         raise InputError(f"There is no mapper {name}; choose {', '.join(MAPPERS)}.")
     if use_gps and name not in WITH_PRIORS:
         raise InputError(
-            f"The mapper {name} cannot adjust with positions; --use-gps works with "
+            f"The mapper {name} cannot adjust with positions; `use_gps` works with "
             f"{', '.join(WITH_PRIORS)}."
         )
 
 
-def report_table(report: ReconstructReport) -> Table:
-    """Return the figures of every component, and in total where there are several."""
-    table = Table(title=f"Sparse model in {report.output}", title_justify="left")
-    table.add_column("Component")
-    for column in (
-        "Registered\nimages",
-        "3D points",
-        "Mean reprojection\nerror (px)",
-        "Mean track\nlength",
-        "Observations",
-    ):
-        table.add_column(column, justify="right", no_wrap=True)
-    for index, model in enumerate(report.models):
-        table.add_row(str(index), *_cells(model, report.images))
-    if len(report.models) > 1:
-        table.add_section()
-        table.add_row("total", *_cells(report.total, report.images))
-    return table
-
-
 def report_lines(report: ReconstructReport) -> list[str]:
-    """Return what stands below the table: pairs, minutes of each stage, images left out."""
-    matches = report.matches
+    """Return the report in lines: rounds, pairs, minutes of each stage, images left out."""
+    matching = report.matching
+    matches = matching.matches
     lines = [
+        *(rounds_lines(matching.rounds) if matching.rounds else []),
         f"Pairs: {matches.requested:,} ({matches.already:,} matched before, "
         f"{matches.matched:,} now), {matches.verified:,} verified.",
         "Minutes: "
         + ", ".join(f"{stage} {time / 60:.1f}" for stage, time in report.seconds.items())
         + f", together {sum(report.seconds.values()) / 60:.1f}.",
+        *view_graph_lines(matching.components),
     ]
-    lines += view_graph_lines(report.components)
     for number, placed in enumerate(report.placed):
         where = f"Model {number}: " if len(report.placed) > 1 else ""
         lines += [where + line for line in placed.lines()]
@@ -286,46 +223,23 @@ def report_lines(report: ReconstructReport) -> list[str]:
     if report.missing:
         lines.append(
             f"Not registered: {len(report.missing)} of {report.images} images: "
-            f"{_first(report.missing)}."
+            f"{listed(report.missing)}."
         )
     return lines
 
 
-def view_graph_lines(groups: Sequence[Sequence[str]]) -> list[str]:
-    """Return which images no verified pair joins to the rest, or nothing."""
-    if len(groups) < 2:
-        return []
-    return [
-        f"View graph: {len(groups)} components; apart from the largest of {len(groups[0]):,} "
-        "images are (a larger --k, or --rounds, may join them):",
-        *(f"  {line}" for line in apart_lines(groups)),
-    ]
-
-
-def _cells(model: ModelSummary, images: int) -> tuple[str, ...]:
-    return (
-        f"{model.registered:,} of {images:,}",
-        f"{model.points:,}",
-        f"{model.mean_reprojection_error:.3f}",
-        f"{model.mean_track_length:.2f}",
-        f"{model.observations:,}",
-    )
-
-
-def _first(names: Sequence[str]) -> str:
-    shown = ", ".join(names[:MISSING_SHOWN])
-    return shown if len(names) <= MISSING_SHOWN else f"{shown}, ..."
-
-
-def _existing(pairs: Path) -> Path:
-    if not pairs.is_file():
-        raise InputError(
-            f"There is no pairs list {pairs}; make it with `colmap-netvlad pairs`, or name one "
-            "with --pairs."
-        )
-    return pairs
-
-
-def _features(database: Path) -> tuple[list[tuple[int, str]], dict[int, int]]:
-    with open_database(database) as colmap:
-        return [(row.image_id, row.name) for row in colmap.images()], colmap.keypoint_counts()
+def as_json(report: ReconstructReport) -> dict[str, Any]:
+    """Return what `colmap-netvlad reconstruct --json` prints."""
+    return {
+        "output": report.output,
+        "images": report.images,
+        "registered": report.total.registered,
+        "total": report.total,
+        "models": report.models,
+        "missing": report.missing,
+        "seconds": report.seconds,
+        "georeferences": [
+            placed.georeference and placed.georeference.summary() for placed in report.placed
+        ],
+        **match_json(report.matching),
+    }

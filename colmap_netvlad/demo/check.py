@@ -9,7 +9,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from colmap_netvlad.demo.render import Flight
+from colmap_netvlad.demo.render import RenderedFlight
 
 MOST_ERROR = 0.01
 """Largest error of a camera centre that counts as right, as a share of the flight's extent."""
@@ -48,7 +48,9 @@ class TruthCheck:
         return float(self.errors.mean()) / self.extent if len(self.errors) else float("inf")
 
 
-def check_against_truth(models: Sequence[pycolmap.Reconstruction], flight: Flight) -> TruthCheck:
+def check_against_truth(
+    models: Sequence[pycolmap.Reconstruction], flight: RenderedFlight
+) -> TruthCheck:
     """Compare the camera centres of the largest model with the flight's."""
     true = dict(zip(flight.names, flight.centres, strict=True))
     largest = max(models, key=lambda model: model.num_reg_images(), default=None)

@@ -10,14 +10,16 @@ import pycolmap
 from matplotlib import image as photos
 from matplotlib.figure import Figure, SubFigure
 
-from colmap_netvlad.demo.render import Flight
+from colmap_netvlad.demo.render import RenderedFlight
 from colmap_netvlad.runtime.files import atomic_path
 
 SAMPLES = 6
 """Photos shown."""
 
 
-def draw_result(path: Path, flight: Flight, models: Sequence[pycolmap.Reconstruction]) -> None:
+def draw_result(
+    path: Path, flight: RenderedFlight, models: Sequence[pycolmap.Reconstruction]
+) -> None:
     """Draw sample photos, and the largest model's points and cameras in the flight's frame."""
     figure = Figure(figsize=(12.5, 6.4), layout="constrained", facecolor="white")
     left, right = figure.subfigures(1, 2, width_ratios=(1.12, 1), squeeze=False)[0]
@@ -34,7 +36,7 @@ def draw_result(path: Path, flight: Flight, models: Sequence[pycolmap.Reconstruc
         figure.savefig(draft, format="png", dpi=110)
 
 
-def _draw_model(panel: SubFigure, flight: Flight, model: pycolmap.Reconstruction) -> None:
+def _draw_model(panel: SubFigure, flight: RenderedFlight, model: pycolmap.Reconstruction) -> None:
     true = dict(zip(flight.names, flight.centres, strict=True))
     images = [image for image in model.images.values() if image.has_pose and image.name in true]
     images.sort(key=lambda image: image.name)

@@ -64,7 +64,7 @@ class FlightOptions:
 
 
 @dataclass(frozen=True, eq=False)
-class Flight:
+class RenderedFlight:
     """Rendered photos and what is true about them.
 
     Attributes:
@@ -93,7 +93,7 @@ class Flight:
         return float(np.linalg.norm(np.ptp(self.centres, axis=0)))
 
 
-def render_flight(folder: Path, options: FlightOptions = FlightOptions()) -> Flight:
+def render_flight(folder: Path, options: FlightOptions = FlightOptions()) -> RenderedFlight:
     """Render a flight into `folder/images` and its true poses into `folder/truth.json`.
 
     The same options give the same photos. Takes about 0.2 s a photo of 640 x 480 on two cores.
@@ -110,7 +110,7 @@ def render_flight(folder: Path, options: FlightOptions = FlightOptions()) -> Fli
     plans = [_plan(options, focal, block) for block in range(options.blocks)]
     size = len(plans[0][0])
     names = tuple(f"DJI_{i + 1:04d}.JPG" for i in range(size * options.blocks))
-    flight = Flight(
+    flight = RenderedFlight(
         images=images,
         names=names,
         centres=np.concatenate([c + b * BLOCK_OFFSET for b, (c, _) in enumerate(plans)]),
@@ -158,11 +158,11 @@ def flight_exists(folder: Path, options: FlightOptions) -> bool:
     return truth.is_file() and json.loads(truth.read_text()).get("options") == vars(options)
 
 
-def read_flight(folder: Path) -> Flight:
+def read_flight(folder: Path) -> RenderedFlight:
     """Read the truth beside photos rendered earlier."""
     truth = json.loads((folder / TRUTH_FILE).read_text(encoding="utf-8"))
     photos = truth["photos"]
-    return Flight(
+    return RenderedFlight(
         folder / "images",
         tuple(photo["name"] for photo in photos),
         np.array([photo["centre"] for photo in photos]),
@@ -343,7 +343,7 @@ def to_wgs84(position: NDArray[np.float64]) -> tuple[float, float, float]:
     )
 
 
-def _truth(flight: Flight, options: FlightOptions) -> dict[str, object]:
+def _truth(flight: RenderedFlight, options: FlightOptions) -> dict[str, object]:
     return {
         "options": vars(options),
         "width": flight.width,

@@ -39,7 +39,7 @@ class Georeference:
 
     def write(self, folder: Path) -> None:
         """Write `georeference.json` into a model's folder."""
-        write_atomically(folder / FILE, json.dumps(self._content(), indent=1) + "\n")
+        write_atomically(folder / FILE, json.dumps(self.content(), indent=1) + "\n")
 
     def lines(self) -> list[str]:
         """Return the sentences for a user."""
@@ -68,7 +68,14 @@ class Georeference:
             lines.append(f"Positions that do not agree and had no say: {shown}{more}.")
         return lines + list(alignment.notes)
 
-    def _content(self) -> dict[str, object]:
+    def summary(self) -> dict[str, object]:
+        """Return where the model is and how well it lies, without the photos one by one."""
+        content = self.content()
+        kept = ("origin", "epsg", "adjusted_with_positions", "residuals", "notes")
+        return {key: content[key] for key in kept}
+
+    def content(self) -> dict[str, object]:
+        """Return what `georeference.json` holds."""
         alignment, frame = self.alignment, self.frame
         return {
             "frame": "cartesian priors" if frame is None else "local east-north-up, m",
@@ -111,7 +118,7 @@ def read_frame(folder: Path) -> Frame:
     if not path.is_file():
         raise InputError(
             f"{folder} has no {FILE}: the model is not in the world yet; run "
-            f"`colmap-netvlad georegister --sparse {folder}` first."
+            "`colmap-netvlad georegister` first."
         )
     try:
         origin = json.loads(path.read_text(encoding="utf-8"))["origin"]

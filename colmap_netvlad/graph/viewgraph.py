@@ -20,6 +20,7 @@ from colmap_netvlad.colmap.database import Database, open_database
 from colmap_netvlad.runtime import progress
 from colmap_netvlad.runtime.errors import InputError
 from colmap_netvlad.runtime.files import atomic_path
+from colmap_netvlad.runtime.sequences import listed
 
 INLIER_SHARE = 0.5
 """R_ew of equation 1: how much the number of matches counts against their spread."""
@@ -177,8 +178,7 @@ def statistics_lines(statistics: GraphStatistics) -> list[str]:
         ("Pairs whose loss splits the model", [f"{a} {b}" for a, b in statistics.bridges]),
     ):
         if items:
-            more = ", ..." if len(items) > LISTED else ""
-            lines.append(f"{title}: {len(items):,}: {', '.join(items[:LISTED])}{more}.")
+            lines.append(f"{title}: {len(items):,}: {listed(items, LISTED)}.")
     return lines
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import pycolmap
@@ -24,8 +25,19 @@ def read_model(folder: Path) -> pycolmap.Reconstruction:
         return pycolmap.Reconstruction(folder)
     except (ValueError, RuntimeError, OSError) as fault:
         raise InputError(
-            f"{folder} is not a COLMAP model (cameras, images, points3D); name one with --model."
+            f"{folder} is not a COLMAP model (cameras, images, points3D); name one with `sparse`."
         ) from fault
+
+
+def largest_model(folders: Sequence[Path]) -> Path:
+    """Return the folder of the model with the most registered images, the first of equal ones.
+
+    Raises:
+        InputError: one of them holds no model.
+    """
+    if len(folders) == 1:
+        return folders[0]
+    return max(folders, key=lambda folder: read_model(folder).num_reg_images())
 
 
 def extend_model(

@@ -12,6 +12,7 @@ from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.mapping.output import model_folder
 from colmap_netvlad.mapping.priors import LOSS_SCALE, with_priors
 from colmap_netvlad.runtime import progress
+from colmap_netvlad.runtime.machine import usable_processors
 
 
 def map_incremental(
@@ -69,7 +70,5 @@ def pipeline_options(
         pipeline.use_prior_position = True
         pipeline.use_robust_loss_on_prior_position = True
         pipeline.prior_position_loss_scale = LOSS_SCALE
-    if options.threads is not None:
-        pipeline.num_threads = options.threads
-        pipeline.mapper.num_threads = options.threads
+    pipeline.num_threads = pipeline.mapper.num_threads = options.threads or usable_processors()
     return pipeline

@@ -19,7 +19,7 @@ def model_folder(output: Path) -> Iterator[Path]:
         InputError: `output` holds something already, or cannot be written.
     """
     if output.exists() and (not output.is_dir() or any(output.iterdir())):
-        raise InputError(f"{output} exists already and is left as it is; name another --output.")
+        raise InputError(f"{output} exists already and is left as it is; name another `output`.")
     try:
         output.parent.mkdir(parents=True, exist_ok=True)
         temporary = Path(tempfile.mkdtemp(prefix=f".{output.name}.", dir=output.parent))

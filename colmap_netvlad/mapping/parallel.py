@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import math
-import os
 import shutil
 import tempfile
 from collections.abc import Callable, Sequence
@@ -19,6 +19,8 @@ from pathlib import Path
 
 import pycolmap
 
+from colmap_netvlad.colmap import engine
+from colmap_netvlad.colmap.copies import copy_images
 from colmap_netvlad.graph.viewgraph import ViewGraph, read_view_graph
 from colmap_netvlad.mapping.incremental import pipeline_options
 from colmap_netvlad.mapping.merge import merge, read_sub_model
@@ -27,11 +29,12 @@ from colmap_netvlad.mapping.output import model_folder
 from colmap_netvlad.mapping.partition import Cluster, partition
 from colmap_netvlad.mapping.priors import with_priors, write_priors
 from colmap_netvlad.mapping.refine import load_cache, rebuild, refine
-from colmap_netvlad.mapping.subset import write_subset
 from colmap_netvlad.runtime import progress, workers
 from colmap_netvlad.runtime.errors import InputError
 from colmap_netvlad.runtime.files import write_atomically
-from colmap_netvlad.runtime.machine import usable_processors
+from colmap_netvlad.runtime.machine import usable_memory, usable_processors
+
+logger = logging.getLogger(__name__)
 
 CLUSTER_IMAGES = 250
 """Default size of a cluster before it is expanded (measured, see docs/parallel-sfm.md)."""
@@ -99,7 +102,7 @@ def map_parallel(
 ) -> list[pycolmap.Reconstruction]:
     """Reconstruct a large flight in clusters and write `output`/0, 1, ...
 
-    What was left out (failed clusters, refused sub-models) is said on standard error;
+    What was left out (failed clusters, refused sub-models) is logged;
     `reconstruct_parallel` returns it.
 
     Args:
@@ -117,7 +120,7 @@ def map_parallel(
     """
     models, report = reconstruct_parallel(database, images, output, options)
     for line in report_lines(report):
-        progress.console.print(line, highlight=False, markup=False)
+        logger.warning(line)
     return models
 
 
@@ -219,7 +222,7 @@ def map_clusters(
     try:
         with progress.step(f"Mapping {len(clusters)} clusters", total) as bar:
             bar.advance(total - sum(len(clusters[number].images) for number in todo))
-            workers.run(jobs, count, bar.advance, finished)
+            workers.run(jobs, count, bar.advance, finished, engine.initialiser())
     finally:
         for part in parts.values():
             shutil.rmtree(part, ignore_errors=True)
@@ -239,7 +242,7 @@ def map_cluster(
 ) -> None:
     """Map one cluster into `folder`/0, 1, ... (in a worker)."""
     subset = folder / "cluster.db"
-    write_subset(database, subset, names)
+    copy_images(database, subset, names)
     if options.priors is not None:
         write_priors(subset, options.priors)
     pipeline = pipeline_options(options, colors=False)
@@ -287,7 +290,7 @@ def merge_clusters(
                 options,
             ),
         )
-        (outcome,) = workers.run([job], 1, bar.advance)
+        (outcome,) = workers.run([job], 1, bar.advance, initialiser=engine.initialiser())
     report.peak_bytes = max(report.peak_bytes, outcome.peak_bytes)
     if outcome.fault is not None:
         raise InputError(
@@ -364,7 +367,7 @@ def worker_count(database: Path, largest: int, jobs: int, options: MappingOption
             database.
     """
     processors = options.threads or usable_processors()
-    memory = options.memory or MEMORY_SHARE * _machine_bytes()
+    memory = options.memory or MEMORY_SHARE * usable_memory()
     share = largest / max(1, _image_count(database))
     one = WORKER_BYTES + BYTES_PER_DATABASE_BYTE * share * database.stat().st_size
     return max(1, min(processors, jobs, math.floor(memory / one)))
@@ -375,13 +378,6 @@ def _image_count(database: Path) -> int:
 
     with open_database(database) as opened:
         return len(opened.images())
-
-
-def _machine_bytes() -> float:
-    try:
-        return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
-    except (AttributeError, ValueError, OSError):
-        return 8 * 2.0**30
 
 
 def _numbered(folder: Path) -> list[Path]:

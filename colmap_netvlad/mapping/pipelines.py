@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pycolmap
 
+from colmap_netvlad.colmap import engine
 from colmap_netvlad.colmap.database import open_database
 from colmap_netvlad.mapping.incremental import map_incremental, pipeline_options
 from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.mapping.output import model_folder
 from colmap_netvlad.mapping.parallel import CLUSTER_IMAGES, map_parallel
-from colmap_netvlad.runtime import progress, workers
+from colmap_netvlad.runtime import workers
 from colmap_netvlad.runtime.errors import InputError
+from colmap_netvlad.runtime.machine import usable_processors
+
+logger = logging.getLogger(__name__)
 
 PARALLEL_IMAGES = 500
 """From this many images with features on, parallel mapping is chosen (measured, see
@@ -37,26 +43,6 @@ def map_automatic(
     return mapper(database, images, output, options)
 
 
-def map_hierarchical(
-    database: Path,
-    images: Path | None,
-    output: Path,
-    options: MappingOptions = MappingOptions(),
-) -> list[pycolmap.Reconstruction]:
-    """Reconstruct with COLMAP's hierarchical mapper (see `incremental.map_incremental`)."""
-    return _map("hierarchically", run_hierarchical, database, images, output, options)
-
-
-def map_global(
-    database: Path,
-    images: Path | None,
-    output: Path,
-    options: MappingOptions = MappingOptions(),
-) -> list[pycolmap.Reconstruction]:
-    """Reconstruct with COLMAP's global mapper, GLOMAP (see `incremental.map_incremental`)."""
-    return _map("globally", run_global, database, images, output, options)
-
-
 def run_hierarchical(
     advance: Callable[[int], None],
     database: Path,
@@ -70,7 +56,7 @@ def run_hierarchical(
     pipeline.incremental_options = pipeline_options(options, colors=images is not None)
     pipeline.clustering_options.leaf_max_num_images = size
     pipeline.clustering_options.image_overlap = max(3, math.ceil(OVERLAP_SHARE * size))
-    pipeline.num_threads = options.threads or -1
+    pipeline.num_threads = options.threads or usable_processors()
     models = pycolmap.hierarchical_mapping(database, images or folder, folder, options=pipeline)
     _write(models, folder)
 
@@ -86,7 +72,7 @@ def run_global(
     pipeline = pycolmap.GlobalPipelineOptions()
     pipeline.random_seed = options.seed
     pipeline.min_model_size = options.min_model_size
-    pipeline.num_threads = options.threads or -1
+    pipeline.num_threads = options.threads or usable_processors()
     models = pycolmap.global_mapping(database, images or folder, folder, options=pipeline)
     _write(models, folder)
 
@@ -97,13 +83,13 @@ def _map(
     database: Path,
     images: Path | None,
     output: Path,
-    options: MappingOptions,
+    options: MappingOptions = MappingOptions(),
 ) -> list[pycolmap.Reconstruction]:
     """Run a mapper that cannot be cancelled in a worker, which Ctrl-C ends."""
     with model_folder(output) as folder:
-        progress.console.print(f"Mapping {how}; COLMAP tells no progress of this mapper.")
+        logger.info("Mapping %s; COLMAP tells no progress of this mapper.", how)
         job = workers.Job(function, (database, images, folder, options))
-        (outcome,) = workers.run([job], 1, lambda count: None)
+        (outcome,) = workers.run([job], 1, lambda count: None, initialiser=engine.initialiser())
         if outcome.fault is not None:
             raise InputError(f"COLMAP could not map {how}: {outcome.fault}.")
         return [pycolmap.Reconstruction(path) for path in sorted(folder.iterdir()) if path.is_dir()]
@@ -116,3 +102,10 @@ def _write(models: dict[int, pycolmap.Reconstruction], folder: Path) -> None:
         if not target.exists():
             target.mkdir()
             model.write(target)
+
+
+map_hierarchical = partial(_map, "hierarchically", run_hierarchical)
+"""COLMAP's hierarchical mapper (see `incremental.map_incremental`)."""
+
+map_global = partial(_map, "globally", run_global)
+"""COLMAP's global mapper, GLOMAP (see `incremental.map_incremental`)."""

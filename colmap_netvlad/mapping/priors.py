@@ -17,8 +17,8 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from colmap_netvlad.colmap.copies import copy_images
 from colmap_netvlad.colmap.database import image_names
-from colmap_netvlad.mapping.subset import write_subset
 
 LOSS_SCALE = 2.795483482915107
 """Standard deviations from which a prior loses weight: the square root of 7.815, the 95 % quantile
@@ -65,7 +65,7 @@ def with_priors(database: Path, priors: PositionPriors | None, folder: Path) -> 
         return
     with tempfile.TemporaryDirectory(prefix=".priors.", dir=folder) as temporary:
         copy = Path(temporary, "priors.db")
-        write_subset(database, copy, image_names(database))
+        copy_images(database, copy, image_names(database))
         write_priors(copy, priors)
         yield copy
 

@@ -6,7 +6,7 @@ import hashlib
 import json
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,7 @@ from scipy import sparse
 
 from colmap_netvlad.cache.ranking import Ranking
 from colmap_netvlad.cache.store import Store
-from colmap_netvlad.colmap.database import image_names, open_database
+from colmap_netvlad.colmap.database import open_database
 from colmap_netvlad.graph.components import components
 from colmap_netvlad.graph.pair import IndexPair
 from colmap_netvlad.graph.verified import CORRECT_MATCHES
@@ -23,9 +23,6 @@ from colmap_netvlad.pairs.connect import connecting_budget, connecting_pairs
 from colmap_netvlad.pairs.rounds import FITTED, next_round, split_budget
 from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval.fusion import similarity_matrix
-from colmap_netvlad.retrieval.methods.hybrid import fusion_depth
-from colmap_netvlad.retrieval.options import RetrievalOptions, check_k
-from colmap_netvlad.retrieval.rank import rank
 from colmap_netvlad.runtime.errors import InputError
 
 PLAN_SETTING = "rounds"
@@ -93,30 +90,6 @@ def match_in_rounds(
     return _Run(project, ranking, budget, rounds, matching, ids, plan).spend()
 
 
-def rank_and_match_in_rounds(
-    project: Project,
-    method: str,
-    options: RetrievalOptions,
-    rounds: int,
-    budget: int | None = None,
-    matching: MatchOptions = MatchOptions(),
-) -> RoundsReport:
-    """Rank deeply by a method and match in rounds; see `match_in_rounds`.
-
-    Args:
-        options: `k` sets the budget where none is given: k times the number of images.
-
-    Raises:
-        InputError: as `methods.rank` and `match_in_rounds`.
-    """
-    count = len(image_names(project.database))
-    check_k(options.k, count)
-    deeper = replace(options, k=min(fusion_depth(options.k), count - 1))
-    ranking = rank(project, method, deeper)
-    spend = plan_budget(options.k, count) if budget is None else budget
-    return match_in_rounds(project, ranking, spend, rounds, matching)
-
-
 def rounds_lines(report: RoundsReport) -> list[str]:
     """Return a line for each round."""
     lines = [
@@ -176,12 +149,12 @@ def _check(project: Project, ranking: Ranking, budget: int, rounds: int) -> dict
             f"{project.database}; make it from this database."
         )
     if rounds < 1:
-        raise InputError(f"--rounds is {rounds}; it must be at least 1.")
+        raise InputError(f"`rounds` is {rounds}; it must be at least 1.")
     least = (len(ids) + 1) // 2
     if budget < least:
         raise InputError(
             f"The budget of {budget} pairs is too small: {len(ids)} images need at least "
-            f"{least} for each to be in one pair; raise --k or --budget."
+            f"{least} for each to be in one pair; raise `k` or `budget`."
         )
     return ids
 

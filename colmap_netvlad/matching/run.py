@@ -11,11 +11,9 @@ features of its chunk, and there are as many processes as processors.
 
 from __future__ import annotations
 
-import sqlite3
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,6 +23,7 @@ from scipy import sparse
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from colmap_netvlad.colmap import engine
+from colmap_netvlad.colmap.copies import copy_features, copy_matches
 from colmap_netvlad.colmap.database import open_database, pair_id
 from colmap_netvlad.graph.pair import IdPair
 from colmap_netvlad.runtime import progress, workers
@@ -46,9 +45,6 @@ BLOCK = 128
 
 WORTH_A_PROCESS = 128
 """Fewer pairs than this take less time than a process takes to start."""
-
-LOCK_SECONDS = 60.0
-"""How long a process waits for the others' writing, a fraction of a second each."""
 
 
 @dataclass(frozen=True)
@@ -160,7 +156,7 @@ def _match_all(
         if count == 1:
             _match_in_chunks(advance, *jobs[0].arguments)
             return
-        for outcome in workers.run(jobs, count, advance):
+        for outcome in workers.run(jobs, count, advance, initialiser=engine.initialiser()):
             if outcome.fault:
                 raise InputError(
                     f"Matching stopped: {outcome.fault.rstrip('.')}. What is matched stays in "
@@ -196,10 +192,10 @@ def _match_apart(database: Path, folder: Path, pairs: Sequence[IdPair], seed: in
     scratch, listed = folder / "matches.db", folder / "pairs.txt"
     pycolmap.Database.open(scratch).close()
     try:
-        _copy_features(database, scratch, aliases)
+        copy_features(database, scratch, aliases)
         listed.write_text("".join(f"{aliases[a]} {aliases[b]}\n" for a, b in pairs))
         _match(scratch, listed, database.parent, seed)
-        _copy_matches(scratch, database, [pair_id(*pair) for pair in pairs])
+        copy_matches(scratch, database, [pair_id(*pair) for pair in pairs])
     finally:
         for used in folder.glob("matches.db*"):
             used.unlink()
@@ -220,42 +216,4 @@ def _match(scratch: Path, listed: Path, watched: Path, seed: int) -> None:
         matching_options=matching,
         pairing_options=pairing,
         verification_options=verification,
-    )
-
-
-def _copy_features(source: Path, target: Path, aliases: dict[int, str]) -> None:
-    with closing(sqlite3.connect(target, timeout=LOCK_SECONDS)) as connection:
-        connection.execute("ATTACH ? AS source", (f"{source.resolve()}",))
-        connection.execute("CREATE TEMP TABLE wanted (image_id INTEGER PRIMARY KEY, alias TEXT)")
-        connection.executemany("INSERT INTO wanted VALUES (?, ?)", aliases.items())
-        _copy_rows(connection, "cameras")
-        connection.execute(
-            "INSERT INTO images (image_id, name, camera_id)"
-            " SELECT image_id, alias, camera_id FROM source.images JOIN wanted USING (image_id)"
-        )
-        for table in ("keypoints", "descriptors"):
-            _copy_rows(connection, table, "WHERE image_id IN (SELECT image_id FROM wanted)")
-        connection.commit()
-
-
-def _copy_matches(source: Path, target: Path, pairs: Sequence[int]) -> None:
-    """Copy the results of some pairs whole or not at all."""
-    with closing(sqlite3.connect(target, timeout=LOCK_SECONDS, isolation_level=None)) as connection:
-        connection.execute("ATTACH ? AS source", (f"{source.resolve()}",))
-        # A transaction that reads before it writes fails at once where another process has
-        # written in between; one that starts as a writer waits for its turn.
-        connection.execute("BEGIN IMMEDIATE")
-        connection.execute("CREATE TEMP TABLE wanted (pair_id INTEGER PRIMARY KEY)")
-        connection.executemany("INSERT INTO wanted VALUES (?)", [(pair,) for pair in pairs])
-        for table in ("matches", "two_view_geometries"):
-            _copy_rows(connection, table, "WHERE pair_id IN (SELECT pair_id FROM wanted)")
-        connection.commit()
-
-
-def _copy_rows(connection: sqlite3.Connection, table: str, where: str = "") -> None:
-    """Copy rows by column name: a migrated database has the same columns in another order."""
-    columns = ", ".join(row[1] for row in connection.execute(f"PRAGMA main.table_info({table})"))
-    connection.execute(
-        f"INSERT OR REPLACE INTO main.{table} ({columns})"
-        f" SELECT {columns} FROM source.{table} {where}"
     )

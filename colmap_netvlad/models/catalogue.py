@@ -53,7 +53,7 @@ class ModelEntry:
             )
         raise InputError(
             f"The weights of {self.name} are not shipped: download {self.url} and put it at "
-            f"{self.path}, or name the file with --model."
+            f"{self.path}, or name the file with `model`."
         )
 
 

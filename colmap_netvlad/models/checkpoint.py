@@ -11,7 +11,6 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from colmap_netvlad import __version__
 from colmap_netvlad.models.aggregation import AGGREGATIONS, build_aggregation
 from colmap_netvlad.models.backbones import build_trunk
 from colmap_netvlad.models.catalogue import CATALOGUE
@@ -21,6 +20,7 @@ from colmap_netvlad.models.trunk import Normalisation
 from colmap_netvlad.models.whitening import Whitening
 from colmap_netvlad.runtime.errors import InputError
 from colmap_netvlad.runtime.files import write_atomically
+from colmap_netvlad.runtime.version import VERSION
 
 METADATA_KEY = "colmap-netvlad"
 FORMAT_VERSION = 1
@@ -57,7 +57,7 @@ def save_checkpoint(
     """
     card = {
         "format_version": FORMAT_VERSION,
-        "created_by": f"colmap-netvlad {__version__}",
+        "created_by": f"colmap-netvlad {VERSION}",
         "backbone": model.trunk.name,
         "normalisation": model.trunk.normalisation.as_dict(),
         "aggregation": model.aggregation.options(),
@@ -203,7 +203,7 @@ def _card(path: Path, text: str | None) -> dict[str, Any]:
     if version != FORMAT_VERSION:
         raise InputError(
             f"{path} is a checkpoint of format version {version}, this is colmap-netvlad "
-            f"{__version__}, which reads version {FORMAT_VERSION}: use the colmap-netvlad it was "
+            f"{VERSION}, which reads version {FORMAT_VERSION}: use the colmap-netvlad it was "
             f"made with ({card.get('created_by', 'unknown')}), or make it again."
         )
     missing = [key for key in REQUIRED if key not in card]

@@ -36,7 +36,7 @@ def choose_device(name: str | None = None) -> torch.device:
     if not present.get(device.type, False):
         raise InputError(
             f"Device {name} is not available on this machine (or this PyTorch is built without "
-            f"it): leave --device out to use the fastest there is."
+            f"it): leave `device` out to use the fastest there is."
         )
     return device
 
@@ -110,10 +110,10 @@ class DescriptorModel:
         Returns:
             descriptors: float32 (B, dim), L2-normalised.
         """
-        return self.describe_with_local(pixels)[0]
+        return self.describe_with_cells(pixels)[0]
 
     @torch.inference_mode()
-    def describe_with_local(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def describe_with_cells(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Describe photos of one size, as a whole and place by place.
 
         Args:
@@ -121,7 +121,7 @@ class DescriptorModel:
 
         Returns:
             descriptors: float32 (B, dim), L2-normalised.
-            local features: float32 (B, C, h, w), L2-normalised, the mean over the turns of each
+            cells: float32 (B, C, h, w), L2-normalised, the mean over the turns of each
             place; zero where the photo has no texture (a mask, a black corner), which would look
             the same in photos that share nothing.
         """

@@ -49,7 +49,7 @@ def load(path: Path) -> GlobalDescriptor:
     except (OSError, ValueError, MatReadError, NotImplementedError) as fault:
         raise InputError(f"{path} is not a MATLAB file that can be read ({fault}).") from fault
     except KeyError as fault:
-        raise InputError(f"{path} holds no variable `net`: not NetVLAD's weights.") from fault
+        raise InputError(f"{path} holds no variable net: not NetVLAD's weights.") from fault
     try:
         return _network(net)
     except (AttributeError, IndexError, ValueError, RuntimeError) as fault:

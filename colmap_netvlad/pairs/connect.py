@@ -15,15 +15,13 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from colmap_netvlad.graph.pair import IndexPair
+from colmap_netvlad.runtime.sequences import MOST_LISTED, listed
 
 TRIES_PER_LINK = 5
 """Candidates tried between the same two components in one go."""
 
 CONNECTING_SHARE = 0.05
 """Extra budget for pairs between components, as a share of the budget."""
-
-MOST_LISTED = 10
-"""Components apart that are listed, and images of each by name."""
 
 
 def connecting_budget(pairs: int) -> int:
@@ -39,11 +37,11 @@ def apart_lines(groups: Sequence[Sequence[str]]) -> list[str]:
     """
     several = [group for group in groups[1:] if len(group) > 1]
     single = [group[0] for group in groups[1:] if len(group) == 1]
-    lines = [f"{len(group)} images: {_first(group)}" for group in several[:MOST_LISTED]]
+    lines = [f"{len(group)} images: {listed(group)}" for group in several[:MOST_LISTED]]
     if len(several) > MOST_LISTED:
         lines.append(f"and {len(several) - MOST_LISTED} smaller components")
     if single:
-        lines.append(f"{len(single)} alone: {_first(single)}")
+        lines.append(f"{len(single)} alone: {listed(single)}")
     return lines
 
 
@@ -88,8 +86,3 @@ def connecting_pairs(
             tries[link] += 1
             chosen.append((i, j))
     return chosen
-
-
-def _first(names: Sequence[str]) -> str:
-    more = f", and {len(names) - MOST_LISTED} more" if len(names) > MOST_LISTED else ""
-    return f"{', '.join(names[:MOST_LISTED])}{more}"

@@ -18,8 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from colmap_netvlad.graph.pair import IndexPair
+from colmap_netvlad.graph.pair import IndexPair, places_by_name
 from colmap_netvlad.graph.verified import CORRECT_MATCHES
+from colmap_netvlad.runtime.sequences import blocks
 
 SATURATION = 100
 """Verified matches from which on a pair's evidence counts fully."""
@@ -246,20 +247,19 @@ def _symmetric_product(
     """Return (a b)[i, j] + (a b)[j, i] of symmetric-pattern matrices at the pairs, in blocks."""
     total = np.zeros(len(first))
     transposed = a.T.tocsr()
-    for rows, inside in _blocks(a.shape[0], first):
+    for rows, inside in _rows_and_pairs(a.shape[0], first):
         local, columns = first[inside] - rows.start, second[inside]
         total[inside] += _sample((a[rows] @ b).tocsr(), local, columns)
         total[inside] += _sample((b[rows] @ transposed).tocsr(), local, columns)
     return total
 
 
-def _blocks(n: int, first: NDArray[np.int64]) -> Iterator[tuple[slice, NDArray[np.int64]]]:
+def _rows_and_pairs(n: int, first: NDArray[np.int64]) -> Iterator[tuple[slice, NDArray[np.int64]]]:
     order = np.argsort(first, kind="stable")
-    for start in range(0, n, BLOCK_ROWS):
-        stop = min(start + BLOCK_ROWS, n)
-        low, high = np.searchsorted(first[order], [start, stop])
+    for rows in blocks(n, BLOCK_ROWS):
+        low, high = np.searchsorted(first[order], [rows.start, rows.stop])
         if high > low:
-            yield slice(start, stop), order[low:high]
+            yield rows, order[low:high]
 
 
 def _sample(
@@ -278,8 +278,7 @@ def _strict_order(
     names: Sequence[str],
 ) -> list[int]:
     """Return the candidates from the best to the worst, equal ones in the order of their names."""
-    place = np.empty(len(names), dtype=np.int64)
-    place[np.argsort(np.array(names, dtype=object), kind="stable")] = np.arange(len(names))
+    place = places_by_name(names)
     a, b = place[np.asarray(first, dtype=np.int64)], place[np.asarray(second, dtype=np.int64)]
     order = np.lexsort((np.maximum(a, b), np.minimum(a, b), -np.asarray(value, dtype=np.float64)))
     return [int(i) for i in order]

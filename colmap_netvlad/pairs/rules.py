@@ -36,9 +36,9 @@ class PartnerRules:
     def check(self) -> None:
         """Raise InputError where a value cannot be meant."""
         if not 0 <= self.other_cameras <= 1:
-            raise InputError(f"--other-cameras is {self.other_cameras}; it is a share, 0 to 1.")
+            raise InputError(f"`other_cameras` is {self.other_cameras}; it is a share, 0 to 1.")
         if self.sequential < 0:
-            raise InputError(f"--sequential is {self.sequential}; it must be at least 0.")
+            raise InputError(f"`sequential` is {self.sequential}; it must be at least 0.")
 
 
 def without_same_frame(ranking: Ranking, frames: Sequence[int | None]) -> Ranking:
@@ -65,6 +65,8 @@ def with_camera_quota(ranking: Ranking, cameras: Sequence[int], k: int, share: f
         cameras: the camera of each image.
         share: 0..1.
     """
+    if not share:
+        return ranking.top(k)
     camera = np.asarray(cameras)
     wanted = ceil(share * k)
     partners = np.full((len(ranking.names), min(k, ranking.depth)), NO_PARTNER, np.int32)
@@ -112,7 +114,13 @@ def join_pairs(
         if len(key) == 2 and key not in joined:
             first, second = sorted((a, b), key=place.__getitem__)
             joined[key] = ImagePair(first, second, 0.0, 0)
-    return sorted(joined.values(), key=lambda pair: (place[pair.name1], place[pair.name2]))
+    return in_order(joined.values(), names)
+
+
+def in_order(pairs: Iterable[ImagePair], names: Sequence[str]) -> list[ImagePair]:
+    """Return pairs in the order of their images' names in a list."""
+    place = {name: i for i, name in enumerate(names)}
+    return sorted(pairs, key=lambda pair: (place[pair.name1], place[pair.name2]))
 
 
 def _natural(name: str) -> list[tuple[int, int, str]]:

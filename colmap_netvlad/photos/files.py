@@ -1,7 +1,4 @@
-"""Photos -> pixels: fast reduced-scale decoding, EXIF orientation, batches of equal size.
-
-Nothing here knows about networks: pixels leave as 8-bit RGB, and a model normalises them itself.
-"""
+"""Files of photos: which there are, whether they are whole, what tells them apart."""
 
 from __future__ import annotations
 
@@ -9,9 +6,13 @@ import hashlib
 import io
 import os
 import struct
+import threading
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 from PIL import Image, UnidentifiedImageError
@@ -26,10 +27,10 @@ MIN_SIDE = 16
 FINGERPRINT_BLOCKS = 8
 FINGERPRINT_BLOCK_BYTES = 16 * 1024
 
-# Aerial mosaics exceed Pillow's guard against decompression bombs. Pillow only reads headers
-# here; OpenCV, which decodes, has its own limit of 2^30 pixels.
-Image.MAX_IMAGE_PIXELS = None
-warnings.filterwarnings("ignore", "Corrupt EXIF data", UserWarning)
+MOST_PIXELS = 2**30
+"""Photos with more pixels than this cannot be decoded: it is OpenCV's limit."""
+
+_OPENING = threading.Lock()
 
 
 class BadPhoto(Exception):
@@ -63,6 +64,19 @@ def find_photos(folder: Path) -> list[str]:
             if not name.startswith(".") and Path(name).suffix.lower() in PHOTO_SUFFIXES:
                 names.append(Path(parent, name).relative_to(folder).as_posix())
     return sorted(names)
+
+
+def file_stamp(path: Path) -> str:
+    """Return size and time of a file: while they stay the same, so does what is in it.
+
+    Raises:
+        BadPhoto: the file is not there or cannot be read.
+    """
+    try:
+        status = path.stat()
+    except OSError as fault:
+        raise BadPhoto(_file_fault(fault)) from fault
+    return f"{status.st_size} {status.st_mtime_ns}"
 
 
 def photo_fingerprint(path: Path) -> str:
@@ -117,7 +131,7 @@ def parse_header(data: bytes) -> PhotoHeader:
     if not data:
         raise BadPhoto("is empty")
     try:
-        with Image.open(io.BytesIO(data)) as photo:
+        with open_header(io.BytesIO(data)) as photo:
             header = PhotoHeader(photo.width, photo.height, _lens(photo))
     except UnidentifiedImageError as fault:
         raise BadPhoto("is not a photo") from fault
@@ -127,9 +141,31 @@ def parse_header(data: bytes) -> PhotoHeader:
         raise BadPhoto("is truncated (the JPEG data end early)")
     if data.startswith(b"\x89PNG") and data.rfind(b"IEND", -4096) < 0:
         raise BadPhoto("is truncated (the PNG data end early)")
+    if header.width * header.height > MOST_PIXELS:
+        raise BadPhoto(f"has {header.width} x {header.height} pixels, more than can be decoded")
     if min(header.width, header.height) < MIN_SIDE:
         raise BadPhoto(f"is only {header.width} x {header.height} pixels")
     return header
+
+
+@contextmanager
+def open_header(source: Path | BinaryIO) -> Iterator[Image.Image]:
+    """Open a photo with Pillow to read its header and EXIF; its pixels are not decoded.
+
+    Aerial mosaics exceed Pillow's guard against decompression bombs, which is a setting of the
+    whole process: it is lifted while the block runs, one block at a time, and no longer.
+
+    Raises:
+        OSError, SyntaxError, ValueError: as Pillow; `UnidentifiedImageError` where it is no photo.
+    """
+    with _OPENING, warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Corrupt EXIF data", UserWarning)
+        guard, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
+        try:
+            with Image.open(source) as photo:
+                yield photo
+        finally:
+            Image.MAX_IMAGE_PIXELS = guard
 
 
 def is_jpeg(data: bytes) -> bool:

@@ -10,13 +10,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
+from PIL import UnidentifiedImageError
 
-EARTH_RADIUS = 6_371_008.8
-"""Mean radius of the earth, m."""
+from colmap_netvlad.photos.files import open_header
+
+if TYPE_CHECKING:
+    import pycolmap
 
 FAR_AWAY = 50_000.0
 """A photo farther than this from the middle of all others is not of this flight, m."""
@@ -107,14 +110,12 @@ def read_gps(photo: Path) -> PosePrior | None:
     The height is NaN where the photo has latitude and longitude alone.
     """
     try:
-        with Image.open(photo) as image:
+        with open_header(photo) as image:
             gps = image.getexif().get_ifd(GPS_IFD)
         latitude = _degrees(gps[2], gps.get(1, "N"))
         longitude = _degrees(gps[4], gps.get(3, "E"))
         altitude = _altitude(gps)
     except (OSError, UnidentifiedImageError, KeyError, ValueError, TypeError, ZeroDivisionError):
-        return None
-    except Image.DecompressionBombError:
         return None
     if not np.isfinite([latitude, longitude]).all():
         return None
@@ -215,24 +216,30 @@ def _around(longitude: NDArray[np.float64], middle: float) -> NDArray[np.float64
     return longitude + 360 * np.round((middle - longitude) / 360)
 
 
-def _offset(raw: NDArray[np.float64], middle: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (N, 2) m east and north of the middle (equirectangular: to 0.1 % at 50 km)."""
-    east = np.radians(_around(raw[:, 1], middle[1]) - middle[1]) * np.cos(np.radians(middle[0]))
-    return EARTH_RADIUS * np.column_stack([east, np.radians(raw[:, 0] - middle[0])])
-
-
 def _metres_between(raw: NDArray[np.float64], middle: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (N,) distances from the middle in m; infinite off the globe, NaN where unknown."""
-    distance = np.hypot(*_offset(raw, middle).T)
-    result: NDArray[np.float64] = np.where(
-        _off_globe(raw) & np.isfinite(distance), np.inf, distance
-    )
+    """Return (N,) distances from the middle in m, straight through the earth and heights aside;
+    infinite off the globe, NaN where unknown."""
+    ground = np.vstack([raw[:, :2], middle])
+    on_earth = _earth().ellipsoid_to_ecef(np.column_stack([ground, np.zeros(len(ground))]))
+    distance = np.linalg.norm(on_earth[:-1] - on_earth[-1], axis=1)
+    result: NDArray[np.float64] = np.where(_off_globe(raw) & ~np.isnan(distance), np.inf, distance)
     return result
 
 
 def _local_metres(raw: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (N, 3) east, north, up in m around the middle; an unknown height counts as 0."""
+    """Return (N, 3) east, north, up in m on the plane that touches the ellipsoid in the middle.
+
+    An unknown height counts as 0.
+    """
     middle = middle_of(raw)
     if middle is None:
         return np.full_like(raw, np.nan)
-    return np.column_stack([_offset(raw, middle), np.nan_to_num(raw[:, 2])])
+    filled = np.column_stack([raw[:, :2], np.nan_to_num(raw[:, 2])])
+    metres: NDArray[np.float64] = _earth().ellipsoid_to_enu(filled, middle[0], middle[1], 0.0)
+    return metres
+
+
+def _earth() -> pycolmap.GPSTransform:
+    import pycolmap  # takes seconds, and most photos' headers are read without it
+
+    return pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)

@@ -1,4 +1,4 @@
-"""A comparison in the terminal and as CSV."""
+"""A comparison as CSV, and in sentences."""
 
 from __future__ import annotations
 
@@ -6,56 +6,14 @@ import csv
 import io
 from pathlib import Path
 
-from rich.console import Console
-from rich.table import Table
-
-from colmap_netvlad.compare.result import EXHAUSTIVE, Comparison, MethodResult
-from colmap_netvlad.report.measures import MEASURES, NOT_RUNNING, shown
+from colmap_netvlad.comparison.result import EXHAUSTIVE, Comparison, MethodResult
+from colmap_netvlad.report.measures import MEASURES
 from colmap_netvlad.runtime.files import write_atomically
-
-BEST = "*"
-"""Marks the best of a row."""
-
-WIDEST = 1000
-"""Characters of the widest table."""
 
 RETRIEVAL_COLUMNS = (
     "pairs", "correct", "accuracy", "recall", "components", "largest_component",
     "articulation_images", "bridges",
 )  # fmt: skip
-
-
-def summary_table(comparison: Comparison) -> Table:
-    """Return the summary: a row for each measure, a column for each method."""
-    table = Table(
-        title=f"{comparison.project}: {comparison.images:,} images, k = {comparison.k}",
-        title_justify="left",
-        caption=f"{BEST} best of the row ({NOT_RUNNING}). {reference_sentence(comparison)}",
-        caption_justify="left",
-    )
-    table.add_column("")
-    for method in comparison.methods:
-        table.add_column(method.name, justify="right", overflow="fold")
-    group = ""
-    for measure in shown(comparison):
-        if measure.group != group and group:
-            table.add_section()
-        group = measure.group
-        best = measure.best(comparison.methods)
-        texts = {method.name: measure.show(method) for method in comparison.methods}
-        cells = [f"[bold]{BEST}{t}[/]" if name in best else t for name, t in texts.items()]
-        table.add_row(measure.title, *cells)
-    return table
-
-
-def print_comparison(comparison: Comparison, console: Console | None = None) -> None:
-    """Print the summary on standard output, whole also where the terminal is narrow."""
-    console = console or Console()
-    table = summary_table(comparison)
-    needed = Console(width=WIDEST).measure(table).maximum
-    if needed > console.width:
-        console = Console(file=console.file, width=needed, force_terminal=console.is_terminal)
-    console.print(table)
 
 
 def reference_sentence(comparison: Comparison) -> str:

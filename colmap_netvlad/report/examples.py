@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_netvlad.cache.ranking import NO_PARTNER
-from colmap_netvlad.compare.evidence import Evidence
-from colmap_netvlad.compare.result import CHANCE
+from colmap_netvlad.comparison.evidence import Evidence
+from colmap_netvlad.comparison.result import CHANCE
 from colmap_netvlad.graph.pair import Pair, as_pair
 from colmap_netvlad.graph.verified import CORRECT_MATCHES
 

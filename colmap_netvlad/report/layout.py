@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from colmap_netvlad.compare.evidence import Evidence, Plan
+from colmap_netvlad.comparison.evidence import Evidence, Plan
 from colmap_netvlad.graph.pair import Pair
 
 LEAST_SPREAD = 0.02

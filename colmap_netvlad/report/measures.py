@@ -5,7 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from colmap_netvlad.compare.result import Comparison, MethodResult, ModelFigures, RetrievalFigures
+from colmap_netvlad.comparison.result import (
+    Comparison,
+    MethodResult,
+    ModelFigures,
+    RetrievalFigures,
+)
 
 NOT_RUNNING = "exhaustive and random are not in the running"
 

@@ -11,10 +11,10 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from colmap_netvlad.compare.evidence import Evidence
-from colmap_netvlad.compare.figures import FULL_RANKING
-from colmap_netvlad.compare.finds import single_finds
-from colmap_netvlad.compare.result import Comparison
+from colmap_netvlad.comparison.evidence import Evidence
+from colmap_netvlad.comparison.figures import FULL_RANKING
+from colmap_netvlad.comparison.finds import single_finds
+from colmap_netvlad.comparison.result import Comparison
 from colmap_netvlad.graph.pair import Pair, as_pair
 from colmap_netvlad.graph.verified import CORRECT_MATCHES
 from colmap_netvlad.report import plots

@@ -17,7 +17,7 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from colmap_netvlad.compare.result import EXHAUSTIVE, Comparison, MethodResult
+from colmap_netvlad.comparison.result import EXHAUSTIVE, Comparison, MethodResult
 from colmap_netvlad.report.measures import seconds as duration
 
 INK = "#010203"

@@ -4,24 +4,23 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from colmap_netvlad.cache.ranking import NO_PARTNER, Ranking
 from colmap_netvlad.cache.store import Store
-from colmap_netvlad.retrieval.search import nearest
-
-if TYPE_CHECKING:
-    from colmap_netvlad.retrieval.options import RetrievalOptions
+from colmap_netvlad.retrieval.options import RetrievalOptions
+from colmap_netvlad.retrieval.search import Vectors, nearest
 
 
-def missing(store: Store, model: str, photos: Mapping[str, str], local: bool = False) -> list[str]:
+def missing(store: Store, model: str, photos: Mapping[str, str], cells: bool = False) -> list[str]:
     """Return the names in `photos` (name -> fingerprint) that the model has not described yet,
-    or described from another content; with `local`, also those without local features."""
+    or described from another content; with `cells`, also those without cells."""
     known = set(store.described(model).items())
-    if local:
-        known &= set(store.described_locally(model).items())
+    if cells:
+        known &= set(store.described_in_cells(model).items())
     return [name for name, photo in photos.items() if (name, photo) not in known]
 
 
@@ -41,31 +40,48 @@ def rank_described(
     names: Sequence[str],
     left_out: Mapping[str, str],
     options: RetrievalOptions,
+    depth: int,
     method: str,
     notes: Sequence[str] = (),
 ) -> Ranking:
-    """Search the neighbours of all described images and rank them.
+    """Search the neighbours of all images described in the store; see `rank_vectors`.
 
     Args:
         store: holds the descriptors of every name that is not in `left_out`.
-        model: fingerprint of the model that described them.
-        names: all image names of the project.
-        left_out: name -> reason; these have no partners and are nobody's partner.
-        options: k, exact, seed.
-        method: name for the ranking.
-        notes: for the report.
+        model: what they are kept under.
 
     Returns:
         A ranking whose `seconds_describe` is what all its descriptors took when they were
         computed, whether now or in an earlier run.
     """
+    described = [name for name in names if name not in left_out]
+    vectors = store.vectors(model, described)
+    ranking = rank_vectors(vectors, names, left_out, options, depth, method)
+    seconds = store.seconds(model, described)
+    return replace(ranking, seconds_describe=seconds, notes=tuple(notes))
+
+
+def rank_vectors(
+    vectors: Vectors | NDArray[np.floating],
+    names: Sequence[str],
+    left_out: Mapping[str, str],
+    options: RetrievalOptions,
+    depth: int,
+    method: str,
+) -> Ranking:
+    """Search the neighbours of all described images and rank them.
+
+    Args:
+        vectors: (N, D) L2-normalised descriptors of the names that are not in `left_out`.
+        names: all image names of the project.
+        left_out: name -> reason; these have no partners and are nobody's partner.
+        options: exact, seed.
+        depth: partners of each image.
+        method: name for the ranking.
+    """
     rows = np.array([i for i, name in enumerate(names) if name not in left_out], np.int32)
-    described = [names[i] for i in rows]
     start = time.perf_counter()
-    found, found_scores = nearest(
-        store.vectors(model, described), options.k, options.exact, options.seed
-    )
-    seconds_search = time.perf_counter() - start
+    found, found_scores = nearest(vectors, depth, options.exact, options.seed)
     partners = np.full((len(names), found.shape[1]), NO_PARTNER, np.int32)
     scores = np.full(partners.shape, -np.inf, np.float32)
     partners[rows] = rows[found]
@@ -75,8 +91,6 @@ def rank_described(
         partners,
         scores,
         method,
-        seconds_describe=store.seconds(model, described),
-        seconds_search=seconds_search,
-        notes=tuple(notes),
+        seconds_search=time.perf_counter() - start,
         left_out=tuple(left_out.items()),
     )

@@ -7,13 +7,15 @@ dense matrix, so 20,000 images fit in memory.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from scipy import sparse
 
 from colmap_netvlad.cache.ranking import NO_PARTNER, Ranking
+from colmap_netvlad.graph.pair import places_by_name
 from colmap_netvlad.runtime.errors import InputError
+from colmap_netvlad.runtime.sequences import blocks
 
 BLOCK_ROWS = 1024
 """Rows of a sparse product that are in memory at once."""
@@ -77,11 +79,11 @@ def expand(
     voters = keep_best(similarity, neighbours)
     total = np.maximum(voters.sum(axis=1), 1e-12)
     voters = (sparse.diags_array(1.0 / total) @ voters).tocsr()
-    blocks = []
-    for rows in _blocks(similarity.shape[0]):
+    expanded_rows = []
+    for rows in blocks(similarity.shape[0], BLOCK_ROWS):
         mixed = (1 - share) * similarity[rows] + share * (voters[rows] @ similarity)
-        blocks.append(keep_best(_without_self(mixed.tocsr(), rows.start), depth))
-    expanded = sparse.vstack(blocks).tocsr()
+        expanded_rows.append(keep_best(_without_self(mixed.tocsr(), rows.start), depth))
+    expanded = sparse.vstack(expanded_rows).tocsr()
     return ((expanded + expanded.T) / 2).tocsr()
 
 
@@ -102,8 +104,7 @@ def ranking_of(
 ) -> Ranking:
     """Return each image's `depth` most similar partners as a ranking; equals go by name."""
     n = len(names)
-    by_name = np.empty(n, dtype=np.int64)
-    by_name[np.argsort(np.array(names, dtype=object), kind="stable")] = np.arange(n)
+    by_name = places_by_name(names)
     rows = np.repeat(np.arange(n), np.diff(similarity.indptr))
     order = np.lexsort((by_name[similarity.indices], -similarity.data.round(9), rows))
     place = np.arange(len(rows)) - similarity.indptr[rows]
@@ -122,8 +123,3 @@ def _without_self(block: sparse.csr_array, start: int) -> sparse.csr_array:
     return sparse.csr_array(
         (entries.data[other], (entries.row[other], entries.col[other])), shape=block.shape
     )
-
-
-def _blocks(n: int) -> Iterator[slice]:
-    for start in range(0, n, BLOCK_ROWS):
-        yield slice(start, min(start + BLOCK_ROWS, n))

@@ -34,18 +34,18 @@ WEIGHT = 4.0
 (`scripts/fit_hybrid.py`)."""
 
 
-def near_first(ranking: Ranking, positions: Positions, k: int) -> Ranking:
-    """Return each image's `k` best partners of a deeper ranking, nearness added.
+def near_first(ranking: Ranking, positions: Positions) -> Ranking:
+    """Return a ranking with nearness added, as deep as it was.
 
     Photos without a position are ranked by appearance as before; where no positions are useful
-    the ranking is only cut. The positions' notes join the ranking's.
+    the ranking stays as it is. The positions' notes join the ranking's.
     """
     if not positions.useful:
-        return replace(ranking.top(k), notes=(*ranking.notes, *positions.notes))
+        return replace(ranking, notes=(*ranking.notes, *positions.notes))
     start = time.perf_counter()
     positions = _without(positions, ranking)
     similarity = add_nearness(similarity_matrix(ranking), positions, SPACING_NEIGHBOURS, WEIGHT)
-    nearer = ranking_of(similarity, ranking.names, ranking.method, k)
+    nearer = ranking_of(similarity, ranking.names, ranking.method, ranking.depth)
     used = f"positions of {int(positions.known.sum())} of {len(ranking.names)} photos used"
     return replace(
         ranking,

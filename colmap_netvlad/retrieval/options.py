@@ -11,6 +11,21 @@ COMPARED = 100
 """Candidates of each image that are compared place by place where nothing else is said."""
 
 
+DEPTH = 200
+DEPTH_FACTOR = 4
+"""A ranking lists at least 200 partners, or four times k: what its first k miss is chosen from
+these by rules, in rounds and between components."""
+
+SEARCH_DEPTH = 400
+"""Global descriptors are asked for at least this many candidates: what one of several rankings
+does not list cannot be fused, and what none lists cannot be compared."""
+
+
+def ranking_depth(k: int) -> int:
+    """Return how many partners a ranking lists where each image gets `k`."""
+    return max(DEPTH, DEPTH_FACTOR * k)
+
+
 def check_k(k: int, num_images: int) -> int:
     """Return `k` clamped to the number of possible partners.
 
@@ -18,7 +33,7 @@ def check_k(k: int, num_images: int) -> int:
         InputError: `k` is not positive, or there are fewer than two images.
     """
     if k < 1:
-        raise InputError(f"--k is {k}; it is the number of partners of each image, at least 1.")
+        raise InputError(f"`k` is {k}; it is the number of partners of each image, at least 1.")
     if num_images < 2:
         raise InputError(
             f"The database has {num_images} image{'s' if num_images != 1 else ''}; "

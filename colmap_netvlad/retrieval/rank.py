@@ -1,4 +1,4 @@
-"""The table of retrieval methods: a function from a project to a ranking under each name."""
+"""Project -> ranking: a method's candidates, re-weighted by positions, compared place by place."""
 
 from __future__ import annotations
 
@@ -6,60 +6,101 @@ from dataclasses import replace
 from pathlib import Path
 
 from colmap_netvlad.cache.ranking import Ranking
-from colmap_netvlad.cache.store import Store
-from colmap_netvlad.colmap.database import image_names
-from colmap_netvlad.flight import read_positions
+from colmap_netvlad.flight import Flight, open_flight
 from colmap_netvlad.photos.positions import Positions
 from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval.gps import near_first
-from colmap_netvlad.retrieval.methods import (
-    Method,
-    deep,
-    find_method,
+from colmap_netvlad.retrieval.methods import Method, deep, find_method, hdf5
+from colmap_netvlad.retrieval.options import (
+    GPS_MODES,
+    SEARCH_DEPTH,
+    RetrievalOptions,
+    check_k,
+    ranking_depth,
 )
-from colmap_netvlad.retrieval.methods.hybrid import fusion_depth
-from colmap_netvlad.retrieval.options import GPS_MODES, RetrievalOptions, check_k
 from colmap_netvlad.retrieval.rerank import rerank
 from colmap_netvlad.runtime.errors import InputError
 
+DEFAULT_OPTIONS = RetrievalOptions()
 
-def rank(project: Project, name: str | Path, options: RetrievalOptions | None = None) -> Ranking:
-    """Rank the images of a project by a method of the table, or by `options.model` if given.
 
-    A `k` above the number of other images is lowered to it; the ranking's notes say so.
+def rank(
+    flight: Flight,
+    name: str | Path,
+    options: RetrievalOptions = DEFAULT_OPTIONS,
+    least_depth: int = 0,
+) -> Ranking:
+    """Rank the images of a flight by a method of the table, or by `options.model` if given.
+
+    It is done once and deep enough for all that follows: the ranking lists `ranking_depth(k)`
+    partners of each image (or all others); who wants k of them cuts it (`Ranking.top`). A `k`
+    above the number of other images is lowered to it; the ranking's notes say so.
+
+    Args:
+        least_depth: partners to list at least.
 
     Raises:
         InputError: no such method, `k` below 1, fewer than two images, or what the method needs
             is not there.
     """
-    options = options or RetrievalOptions()
     if options.rerank < 0:
-        raise InputError(f"--rerank is {options.rerank}; it is a number of candidates, 0 for none.")
-    # `hybrid` is told its deep model by --model; for the others a model is the method.
-    method = find_method(name if str(name) == "hybrid" else options.model or name)
-    count = len(image_names(project.database))
-    k = check_k(options.k, count)
-    compared = min(options.rerank, count - 1) if method.model else 0
-    depth = max(k, compared)
-    positions = _positions(project, method, options)
-    if positions is None:
-        ranking = method.rank(project, replace(options, k=depth))
-    else:
-        deeper = method.rank(project, replace(options, k=fusion_depth(depth)))
-        ranking = near_first(deeper, positions, depth)
-    if compared:
-        model = deep.model_fingerprint(deep.checkpoint_file(options.model or method.model or ""))
-        with Store(project.cache) as store:
-            ranking = rerank(ranking, store, model, k, compared)
-        note = f"{compared} candidates of each image compared place by place (--rerank)"
+        raise InputError(f"`rerank` is {options.rerank}; it is a number of candidates, 0 for none.")
+    method = _method(name, options)
+    others = len(flight.images) - 1
+    k = check_k(options.k, len(flight.images))
+    depth = min(max(ranking_depth(k), least_depth), others)
+    positions = _positions(flight, method, options)
+    ranking = method.candidates(flight, options, min(max(SEARCH_DEPTH, depth), others))
+    if positions is not None:
+        ranking = near_first(ranking, positions)
+    if method.model and options.rerank:
+        model = deep.cells_key(options.model or method.model, options)
+        compared = min(options.rerank, others)
+        ranking = rerank(ranking, flight.store, model, k, compared)
+        note = f"{compared} candidates of each image compared place by place"
         ranking = replace(ranking, notes=(*ranking.notes, note))
     if k < options.k:
-        note = f"k lowered from {options.k} to {k}: the project has {count} images"
+        note = f"k lowered from {options.k} to {k}: the project has {others + 1} images"
         ranking = replace(ranking, notes=(*ranking.notes, note))
-    return ranking
+    return ranking.top(depth)
 
 
-def _positions(project: Project, method: Method, options: RetrievalOptions) -> Positions | None:
+def rank_project(
+    project: Project,
+    name: str | Path,
+    options: RetrievalOptions = DEFAULT_OPTIONS,
+    least_depth: int = 0,
+) -> Ranking:
+    """Open a project and `rank` its images."""
+    with open_flight(project) as flight:
+        return rank(flight, name, options, least_depth)
+
+
+def export_descriptors(
+    flight: Flight, name: str | Path, options: RetrievalOptions, file: Path
+) -> None:
+    """Write the global descriptors of a ranked flight in hloc's HDF5 layout.
+
+    Raises:
+        InputError: the method has no descriptors of its own, or the file cannot be written.
+    """
+    method = _method(name, options)
+    if method.model is None:
+        raise InputError(
+            f"{method.name} has no deep descriptors to export; choose a method that has a model."
+        )
+    hdf5.export(flight, options, options.model or method.model, file)
+
+
+def _method(name: str | Path, options: RetrievalOptions) -> Method:
+    """Return the method: a model that is given is one, unless the named method takes a model."""
+    if options.model is None:
+        return find_method(name)
+    named = find_method(name)
+    return named if named.takes_model else find_method(options.model)
+
+
+def _positions(flight: Flight, method: Method, options: RetrievalOptions) -> Positions | None:
     """Return the positions that are to re-weight a method's candidates, or None.
 
     Raises:
@@ -67,14 +108,14 @@ def _positions(project: Project, method: Method, options: RetrievalOptions) -> P
     """
     mode = options.gps or ("auto" if method.gps else "off")
     if mode not in GPS_MODES:
-        raise InputError(f"There is no --gps {mode}; choose {', '.join(GPS_MODES)}.")
+        raise InputError(f"`gps` is {mode}; choose {', '.join(GPS_MODES)}.")
     if mode == "off" or "positions" in method.needs:
         return None
-    positions = read_positions(project)
+    positions = flight.positions
     if mode == "require" and not positions.useful:
         why = f" {positions.notes[-1]}" if positions.notes else ""
         raise InputError(
-            f"Positions are required, but neither {project.database} nor the photos' EXIF have "
-            f"any that tell photos apart.{why} Use --gps auto or off."
+            f"Positions are required, but neither {flight.project.database} nor the photos' EXIF "
+            f"have any that tell photos apart.{why} Use `gps` auto or off."
         )
     return positions if positions.useful or positions.notes else None

@@ -1,7 +1,7 @@
 """Compare candidates place by place, and order them by what agrees.
 
 A global descriptor says that two photos show the same kind of ground. That they show the same
-piece of it is known when places that look alike also lie alike: the local features behind the
+piece of it is known when places that look alike also lie alike: the cells behind the
 descriptors are matched (mutual nearest neighbours), and the matches that agree on one similarity
 transform (turn, scale, shift) are counted. Photos from above are nearly such transforms of each
 other, photos of facades in part. A pair takes about a hundredth of matching its SIFT features.
@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from threadpoolctl import threadpool_limits
 
-from colmap_netvlad.cache.cells import LocalFeatures
+from colmap_netvlad.cache.cells import Cells
 from colmap_netvlad.cache.ranking import NO_PARTNER, Ranking
 from colmap_netvlad.cache.store import Store
 from colmap_netvlad.retrieval.fusion import expand, keep_best, ranking_of
@@ -50,7 +50,7 @@ TAIL = 1e-3
 """Weight of the candidates' own order, which decides where nothing agrees."""
 
 CACHE_BYTES = 512 << 20
-"""Memory for local features, so that an image's are not read anew for each pair."""
+"""Memory for cells, so that an image's are not read anew for each pair."""
 
 KEEP_PAIRS = 2000
 """Pairs compared between two writes to the store."""
@@ -59,16 +59,17 @@ Pairs = NDArray[np.intp]
 
 
 def rerank(candidates: Ranking, store: Store, model: str, k: int, depth: int = COMPARED) -> Ranking:
-    """Return each image's `k` best partners, `depth` candidates compared place by place.
+    """Return a ranking as deep as the candidates', `depth` of them compared place by place.
 
-    The first half are its best candidates; what these teach chooses the others, so that a
+    The first half are an image's best candidates; what these teach chooses the others, so that a
     neighbour whom the descriptors overlooked is found by way of its neighbours. Counts are kept
     in the store: pairs compared before are not compared again.
 
     Args:
         candidates: by whatever found them, `max(k, depth)` deep where there are as many images.
-        store: has the images' local features; a pair without them is not compared.
-        model: fingerprint of the model that they are from.
+        store: has the images' cells; a pair without them is not compared.
+        model: what the store keeps the cells under.
+        k: partners that each image will get.
     """
     counted = _Counted(store, model, candidates)
     own = TAIL * _own_order(candidates)
@@ -81,7 +82,7 @@ def rerank(candidates: Ranking, store: Store, model: str, k: int, depth: int = C
         similarity = (expanded + own).tocsr()
         seconds += time.perf_counter() - start
     # Logarithms: twice the matches are not twice as likely to be a true pair.
-    best = ranking_of(similarity.log1p(), candidates.names, candidates.method, k)
+    best = ranking_of(similarity.log1p(), candidates.names, candidates.method, candidates.depth)
     return replace(
         candidates,
         partners=best.partners,
@@ -93,7 +94,7 @@ def rerank(candidates: Ranking, store: Store, model: str, k: int, depth: int = C
 
 @dataclass(frozen=True, eq=False)
 class Places:
-    """Local features ready to be compared.
+    """Cells ready to be compared.
 
     Attributes:
         vectors: (P, D) L2-normalised.
@@ -104,9 +105,9 @@ class Places:
     at: NDArray[np.float32]
 
     @classmethod
-    def of(cls, features: LocalFeatures) -> Places:
-        """Decode local features, without places that have no texture."""
-        vectors, at = features.vectors(), features.places()
+    def of(cls, cells: Cells) -> Places:
+        """Decode cells, without places that have no texture."""
+        vectors, at = cells.vectors(), cells.places()
         textured = vectors.any(axis=1)
         return cls(vectors[textured], at[textured])
 
@@ -152,7 +153,7 @@ class _Counted:
     """The pairs of a ranking's images that were compared, and what agreed."""
 
     def __init__(self, store: Store, model: str, candidates: Ranking) -> None:
-        numbers = store.local_numbers(model)
+        numbers = store.cell_numbers(model)
         left_out = {name for name, _ in candidates.left_out}
         ids = [0 if name in left_out else numbers.get(name, 0) for name in candidates.names]
         self._ids = np.array(ids, np.int64)
@@ -162,7 +163,7 @@ class _Counted:
         self._matches = np.zeros(0)
 
     def compare(self, pairs: Pairs) -> float:
-        """Count the agreeing matches of pairs that have local features; return the seconds it
+        """Count the agreeing matches of pairs that have cells; return the seconds it
         took, now or when they were first compared."""
         pairs = pairs[(self._ids[pairs] > 0).all(axis=1)]
         keys = _joined(np.sort(self._ids[pairs], axis=1))
@@ -205,7 +206,7 @@ def _compare(pairs: Pairs, ids: NDArray[np.int64], store: Store) -> None:
     starts = np.flatnonzero(np.diff(pairs[:, 0], prepend=-1))
     rows: list[tuple[int, int, int, float]] = []
     with (
-        step("Comparing local features", len(pairs)) as bar,
+        step("Comparing photos place by place", len(pairs)) as bar,
         # A pair is too little work to share: a thread for each of several pairs is twice as fast.
         threadpool_limits(1, "blas"),
         ThreadPoolExecutor(usable_processors()) as pool,
@@ -227,11 +228,11 @@ def _compare(pairs: Pairs, ids: NDArray[np.int64], store: Store) -> None:
 
 def _reader(store: Store, ids: NDArray[np.int64], example: int) -> Callable[[int], Places]:
     """Return a function from an image's index to its features, the latest kept in memory."""
-    values = store.read_local(int(ids[example])).codes.size
+    values = store.read_cells(int(ids[example])).codes.size
     most = max(CACHE_BYTES // (4 * max(values, 1)), 2)
 
     @lru_cache(maxsize=most)
     def read(image: int) -> Places:
-        return Places.of(store.read_local(int(ids[image])))
+        return Places.of(store.read_cells(int(ids[image])))
 
     return read

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_netvlad.runtime.progress import step
+from colmap_netvlad.runtime.sequences import blocks
 
 EXACT_UP_TO = 20_000
 """Exact search up to this number of images, HNSW above. `benchmarks/search_scale.py --switch`
@@ -74,14 +75,14 @@ def _exact(vectors: Vectors | NDArray[np.floating], k: int) -> Neighbours:
     count = vectors.shape[0]
     partners = np.zeros((count, k), np.int32)
     scores = np.full((count, k), -np.inf, np.float32)
-    blocks = _blocks(count, vectors.shape[1])
-    with step("Searching neighbours", len(blocks)) as bar:
-        for i, rows in enumerate(blocks):
+    parts = _blocks_of(vectors)
+    with step("Searching neighbours", len(parts)) as bar:
+        for i, rows in enumerate(parts):
             left = _load(vectors, rows)
             own = left @ left.T
             np.fill_diagonal(own, -np.inf)
             _merge(partners, scores, rows, own, rows)
-            for columns in blocks[i + 1 :]:
+            for columns in parts[i + 1 :]:
                 # One product serves both images of a pair.
                 product = left @ _load(vectors, columns).T
                 _merge(partners, scores, rows, product, columns)
@@ -124,15 +125,15 @@ def _hnsw(vectors: Vectors | NDArray[np.floating], k: int, seed: int) -> Neighbo
     index.hnsw.efSearch = max(2 * (k + 2), 64)
     partners = np.zeros((count, k), np.int32)
     scores = np.zeros((count, k), np.float32)
-    blocks = _blocks(count, dim)
+    parts = _blocks_of(vectors)
     with step("Indexing descriptors", count) as bar, _one_thread(faiss):
-        for rows in blocks:
+        for rows in parts:
             block = _load(vectors, rows)
             index.add(block)
             bar.advance(len(block))
     short: list[int] = []
     with step("Searching neighbours", count) as bar:
-        for rows in blocks:
+        for rows in parts:
             block = _load(vectors, rows)
             found_scores, found = index.search(block, min(k + 2, count))
             for i, (row, row_scores) in enumerate(zip(found, found_scores, strict=True)):
@@ -145,13 +146,13 @@ def _hnsw(vectors: Vectors | NDArray[np.floating], k: int, seed: int) -> Neighbo
                 scores[rows.start + i] = row_scores[keep]
             bar.advance(len(block))
     for row_number in short:
-        _search_exactly(vectors, blocks, row_number, partners, scores)
+        _search_exactly(vectors, parts, row_number, partners, scores)
     return partners, scores
 
 
 def _search_exactly(
     vectors: Vectors | NDArray[np.floating],
-    blocks: list[slice],
+    parts: list[slice],
     row: int,
     partners: NDArray[np.int32],
     scores: NDArray[np.float32],
@@ -160,16 +161,16 @@ def _search_exactly(
     rows = slice(row, row + 1)
     query = _load(vectors, rows)
     scores[rows] = -np.inf
-    for columns in blocks:
+    for columns in parts:
         found = query @ _load(vectors, columns).T
         if columns.start <= row < columns.stop:
             found[0, row - columns.start] = -np.inf
         _merge(partners, scores, rows, found, columns)
 
 
-def _blocks(count: int, dim: int) -> list[slice]:
-    size = min(max(BLOCK_BYTES // (4 * max(dim, 1)), 16), BLOCK_ROWS)
-    return [slice(start, min(start + size, count)) for start in range(0, count, size)]
+def _blocks_of(vectors: Vectors | NDArray[np.floating]) -> list[slice]:
+    count, dim = vectors.shape
+    return list(blocks(count, min(max(BLOCK_BYTES // (4 * max(dim, 1)), 16), BLOCK_ROWS)))
 
 
 def _load(vectors: Vectors | NDArray[np.floating], rows: slice) -> NDArray[np.float32]:

@@ -14,8 +14,6 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 from typing import Any
 
-from colmap_netvlad.colmap.engine import silence
-from colmap_netvlad.runtime import progress
 from colmap_netvlad.runtime.errors import InputError
 
 POLL_SECONDS = 0.5
@@ -52,17 +50,24 @@ class Outcome:
     peak_bytes: int = 0
 
 
+def _nothing() -> None:
+    pass
+
+
 def run(
     jobs: Sequence[Job],
     workers: int,
     advance: Callable[[int], None],
     finished: Callable[[int, Outcome], None] = lambda number, outcome: None,
+    initialiser: Callable[[], None] = _nothing,
 ) -> list[Outcome]:
     """Run jobs in at most `workers` processes at a time and return how each ended.
 
     Args:
         advance: is told the units done, of all jobs together.
         finished: is called in this process with a job's number as it ends.
+        initialiser: is called in each worker before its job; a module-level function, or a
+            `functools.partial` of one.
 
     An exception in this process (Ctrl-C) ends all workers before it goes on.
     """
@@ -79,7 +84,7 @@ def run(
                 receiver, sender = context.Pipe(duplex=False)
                 process = context.Process(
                     target=_work,
-                    args=(jobs[number], counters[number], sender, progress.verbose),
+                    args=(jobs[number], counters[number], sender, initialiser),
                 )
                 process.start()
                 sender.close()
@@ -116,7 +121,7 @@ def _outcome(process: SpawnProcess, receiver: Connection) -> Outcome:
     return Outcome(f"its process crashed (exit code {code})")
 
 
-def _work(job: Job, counter: Any, sender: Connection, verbose: bool) -> None:
+def _work(job: Job, counter: Any, sender: Connection, initialiser: Callable[[], None]) -> None:
     # Ctrl-C reaches the whole group; the parent alone decides and ends its workers.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
@@ -125,10 +130,9 @@ def _work(job: Job, counter: Any, sender: Connection, verbose: bool) -> None:
         with counter.get_lock():
             counter.value += count
 
-    progress.verbose = verbose
     fault = None
     try:
-        silence()
+        initialiser()
         job.function(advance, *job.arguments)
     except InputError as known:
         fault = known.message

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from colmap_netvlad.colmap.database import copy_database
+from colmap_netvlad.colmap.copies import copy_database
+from colmap_netvlad.flight import open_flight
 from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval.options import RetrievalOptions
 from colmap_netvlad.retrieval.rank import rank
@@ -65,12 +66,12 @@ def evaluate(
         with tempfile.TemporaryDirectory(prefix="colmap-netvlad-") as folder:
             database = Path(folder) / "project.db"
             copy_database(databases / f"{scene.name}.db", database, matches=False)
-            project = Project(database, scene.images)
             full = replace(options or RetrievalOptions(), k=len(scene) - 1)
-            for method in methods:
-                ranking = rank(project, method, full)
-                scores[method][scene.name] = score(ranking, scene)
-                seconds[method] += ranking.seconds_describe + ranking.seconds_search
+            with open_flight(Project(database, scene.images)) as flight:
+                for method in methods:
+                    ranking = rank(flight, method, full)
+                    scores[method][scene.name] = score(ranking, scene)
+                    seconds[method] += ranking.seconds_describe + ranking.seconds_search
     photos = sum(len(scene) for scene in scenes)
     return [Measured(method, scores[method], seconds[method] / photos) for method in methods]
 

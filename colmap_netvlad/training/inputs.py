@@ -211,7 +211,7 @@ class KeptFeatures:
         if needed > free:
             raise InputError(
                 f"The kept features need {needed / 2**30:.1f} GiB in {self.path.parent}, which has "
-                f"{free / 2**30:.1f} GiB free; make room, or lower --views."
+                f"{free / 2**30:.1f} GiB free; make room, or lower `views`."
             )
         try:
             with self.path.open("r+b") as file, step("Features of views", total) as bar:

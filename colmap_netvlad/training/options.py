@@ -139,28 +139,29 @@ class TrainOptions:
             choices = item.metadata.get("choices")
             value = getattr(self, item.name)
             if choices and value not in choices:
-                raise InputError(f"{item.name} is {value!r}; it is one of {', '.join(choices)}.")
+                raise InputError(f"`{item.name}` is {value!r}; it is one of {', '.join(choices)}.")
         positive = (
             "clusters width height scenes_per_batch positives epochs iterations validate_every "
             "checkpoint_every long_side learning_rate scale_min"
         )
         for name in positive.split():
             if getattr(self, name) <= 0:
-                raise InputError(f"{name} is {getattr(self, name)}; it must be more than 0.")
+                raise InputError(f"`{name}` is {getattr(self, name)}; it must be more than 0.")
         if self.scale_max < self.scale_min:
-            raise InputError(f"scale_max {self.scale_max} is below scale_min {self.scale_min}.")
+            raise InputError(f"`scale_max` {self.scale_max} is below `scale_min` {self.scale_min}.")
         if self.rotations not in (1, 4):
-            raise InputError(f"rotations is {self.rotations}; it is 1 or 4.")
+            raise InputError(f"`rotations` is {self.rotations}; it is 1 or 4.")
         if self.loss == CORRESPONDENCE and "netvlad" not in self.aggregation:
             raise InputError("The correspondence loss teaches the local features of a NetVLAD.")
         if self.loss == CORRESPONDENCE and self.teacher is not None:
             raise InputError(
                 "A teacher says how alike photos are, of which the correspondence loss knows "
-                "nothing; leave teacher out, or choose another loss."
+                "nothing; leave `teacher` out, or choose another loss."
             )
         if self.views and self.frozen is None:
             raise InputError(
-                "views keeps frozen features on disk: say with frozen up to where the trunk stays."
+                "`views` keeps frozen features on disk: say with `frozen` up to where the trunk "
+                "stays."
             )
 
     def for_losses(self) -> LossOptions:
@@ -225,7 +226,7 @@ def read_recipe(path: Path) -> dict[str, Any]:
     for name, value in record.items():
         if name not in known:
             raise InputError(
-                f"The recipe {path} has {name}, which is no setting of `train`; "
+                f"The recipe {path} has {name}, which is no setting of training; "
                 "`colmap-netvlad train --help` lists them."
             )
         kind = known[name].metadata.get("type", type(known[name].default))

@@ -16,6 +16,7 @@ bit for bit on the same processor.
 from __future__ import annotations
 
 import hashlib
+import logging
 import math
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -48,6 +49,8 @@ from colmap_netvlad.training.stages import SplitNetwork
 from colmap_netvlad.training.teacher import Teacher
 from colmap_netvlad.training.validate import Validation
 from colmap_netvlad.training.visibility import by_views
+
+logger = logging.getLogger(__name__)
 
 CHECKPOINT_VERSION = 1
 
@@ -103,17 +106,7 @@ def train(
             is not a number, or the disk is full.
     """
     check_disjoint([*scenes, *validation])
-    run = Run(
-        scenes,
-        validation,
-        options,
-        output,
-        device=device,
-        name=name,
-        metadata=metadata,
-        cache=cache,
-    )
-    return run.go()
+    return Run(scenes, validation, options, output, Card(device, name, metadata, cache)).go()
 
 
 def _check_points(scenes: Sequence[Scene], options: TrainOptions) -> None:
@@ -127,7 +120,7 @@ def _check_points(scenes: Sequence[Scene], options: TrainOptions) -> None:
     if unknown:
         raise InputError(
             f"The annotation of {', '.join(unknown)} does not say where its photos show which "
-            "points, which the correspondence loss needs: annotate again, or set pseudo_views."
+            "points, which the correspondence loss needs: annotate again, or set `pseudo_views`."
         )
 
 
@@ -147,6 +140,16 @@ def report_lines(report: TrainReport) -> list[str]:
     return lines
 
 
+@dataclass(frozen=True)
+class Card:
+    """Where a run computes and what its model says of itself; see `train`."""
+
+    device: str | None = None
+    name: str | None = None
+    metadata: dict[str, Any] | None = None
+    cache: Path | None = None
+
+
 class Run:
     """A training run under way. Use `train`."""
 
@@ -156,17 +159,14 @@ class Run:
         validation: Sequence[Scene],
         options: TrainOptions,
         output: Path,
-        *,
-        device: str | None = None,
-        name: str | None = None,
-        metadata: dict[str, Any] | None = None,
-        cache: Path | None = None,
+        card: Card | None = None,
     ) -> None:
+        card = card or Card()
         self.options = options
         self.output = output
-        self.name = name or output.resolve().name
-        self.metadata = metadata or {}
-        self.device = choose_device(device)
+        self.name = card.name or output.resolve().name
+        self.metadata = card.metadata or {}
+        self.device = choose_device(card.device)
         self.validation_scenes = [scene.name for scene in validation]
         self.real_scenes = list(scenes)
         _check_points(self.real_scenes, options)
@@ -177,7 +177,7 @@ class Run:
         saved = self._load_checkpoint()
         self.network = SplitNetwork(self._build(saved), options.frozen).to(self.device)
         self.network.train(False)
-        cache = cache or output / "cache"
+        cache = card.cache or output / "cache"
         self.validation = Validation(validation, options.long_side, options.rotations, cache)
         self.inputs: Inputs = (
             KeptFeatures(self.photos, self.network, options, cache)
@@ -292,7 +292,7 @@ class Run:
         )
         return (
             f"The loss is not a number in batch {self.number} of epoch {self.epoch} ({photos}). "
-            f"The last good checkpoint is {self.output / 'checkpoint.pt'}; lower --learning-rate, "
+            f"The last good checkpoint is {self.output / 'checkpoint.pt'}; lower `learning_rate`, "
             "or look at these photos."
         )
 
@@ -359,7 +359,7 @@ class Run:
             self.history.append(entry)
             if entry.figure > best or not scores:
                 self._save_model("best")
-            progress.console.print(entry.line(), highlight=False)
+            logger.info(entry.line())
             write_history(self.output, self.history)
         if last:
             self._save_model("last")
@@ -424,7 +424,7 @@ class Run:
         if len(features) < layer.clusters:
             raise InputError(
                 f"{len(features)} local features cannot give {layer.clusters} centres; add photos "
-                "or lower --clusters."
+                "or lower `clusters`."
             )
         layer.initialise(features, self.options.seed)
         if self.options.assignment is not None:
@@ -492,7 +492,7 @@ class Run:
         if version != CHECKPOINT_VERSION:
             raise InputError(
                 f"{path} is of version {version}, this program continues version "
-                f"{CHECKPOINT_VERSION}; give another --output."
+                f"{CHECKPOINT_VERSION}; give another `output`."
             )
         now = self.options.as_dict()
         changed = sorted(
@@ -501,11 +501,11 @@ class Run:
         if changed:
             raise InputError(
                 f"{self.output} holds a run with other settings ({', '.join(changed)}); give "
-                "another --output, or remove its checkpoint.pt to start anew."
+                "another `output`, or remove its checkpoint.pt to start anew."
             )
         if saved["scenes"] != self._scene_key():
             raise InputError(
-                f"{self.output} holds a run on other scenes; give another --output, or remove its "
+                f"{self.output} holds a run on other scenes; give another `output`, or remove its "
                 "checkpoint.pt to start anew."
             )
         return saved

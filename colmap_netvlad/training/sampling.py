@@ -125,7 +125,7 @@ class Sampler:
         if self.options.mining == "global" or not self.options.same_flight:
             raise InputError(
                 f"There is one usable scene only ({self.scenes[only].name}), and negatives come "
-                "from other scenes: annotate another flight, or ask for --same-flight negatives."
+                "from other scenes: annotate another flight, or ask for `same_flight` negatives."
             )
         scene = self.scenes[only]
         self._anchors[only] = [i for i in self._anchors[only] if len(self._strangers(only, i))]

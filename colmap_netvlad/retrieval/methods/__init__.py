@@ -8,12 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from colmap_netvlad.cache.ranking import Ranking
+from colmap_netvlad.flight import Flight
 from colmap_netvlad.models.catalogue import CATALOGUE, DEFAULT
-from colmap_netvlad.project import Project
-from colmap_netvlad.retrieval.methods import baselines, bow, deep, hybrid, spatial, vlad
+from colmap_netvlad.retrieval.methods import baselines, bow, deep, hdf5, hybrid, spatial, vlad
 from colmap_netvlad.retrieval.options import RetrievalOptions
 from colmap_netvlad.runtime.errors import InputError
 
+DESCRIPTOR_SUFFIXES = (".h5", ".hdf5")
 CHECKPOINT_SUFFIXES = (".safetensors", ".mat")
 
 
@@ -25,25 +26,38 @@ class Method:
         name: what users call it.
         summary: one line with its source.
         needs: of "photos", "features", "positions".
-        rank: ranks the images of a project by appearance (or, for `spatial`, by position). Where
-            there is a `model` these are candidates, which are compared place by place then.
+        candidates: ranks a flight's images by appearance (or, for `spatial`, by position), as many
+            partners of each as it is told. Where there is a `model` these are compared place by
+            place then.
         gps: whether positions join in by themselves.
         model: the deep model it runs: a name of the catalogue or a checkpoint file.
+        takes_model: whether `RetrievalOptions.model` replaces its model; for the others a model
+            given there is a method of its own.
     """
 
     name: str
     summary: str
     needs: frozenset[str]
-    rank: Callable[[Project, RetrievalOptions], Ranking]
+    candidates: Callable[[Flight, RetrievalOptions, int], Ranking]
     gps: bool = False
     model: str | Path | None = None
+    takes_model: bool = False
 
 
 def _deep_method(name: str, summary: str, checkpoint: str | Path) -> Method:
-    def rank_deep(project: Project, options: RetrievalOptions) -> Ranking:
-        return deep.rank(project, checkpoint, options)
+    def candidates(flight: Flight, options: RetrievalOptions, depth: int) -> Ranking:
+        return deep.candidates(flight, options, depth, checkpoint)
 
-    return Method(name, summary, frozenset({"photos"}), rank_deep, model=checkpoint)
+    return Method(name, summary, frozenset({"photos"}), candidates, model=checkpoint)
+
+
+def _file_method(file: Path) -> Method:
+    def candidates(flight: Flight, options: RetrievalOptions, depth: int) -> Ranking:
+        return hdf5.candidates(flight, options, depth, file)
+
+    summary = f"The global descriptors in {file}, compared place by place by {DEFAULT}."
+    needs = frozenset({"photos"})
+    return Method(file.stem, summary, needs, candidates, model=DEFAULT, takes_model=True)
 
 
 METHODS: dict[str, Method] = {
@@ -54,32 +68,33 @@ METHODS: dict[str, Method] = {
             "bow",
             "COLMAP's vocabulary tree (Schoenberger et al., ACCV 2016).",
             frozenset({"features"}),
-            bow.rank,
+            bow.candidates,
         ),
         Method(
             "vlad",
             "VLAD on SIFT, 256 words (Jegou et al., CVPR 2010): the paper's baseline.",
             frozenset({"features"}),
-            vlad.rank,
+            vlad.candidates,
         ),
         Method(
             "hybrid",
             "Candidates of the default deep model, VLAD and, where there is any, GPS, compared"
             " place by place: ours.",
             frozenset({"photos", "features"}),
-            hybrid.rank,
+            hybrid.candidates,
             gps=True,
             model=DEFAULT,
+            takes_model=True,
         ),
         Method(
             "spatial",
             "Nearest on the ground by position priors or GPS, as COLMAP's spatial matcher.",
             frozenset({"positions"}),
-            spatial.rank,
+            spatial.candidates,
         ),
         Method(
             "exhaustive",
-            "All pairs; --k is ignored. The reference for sets where it can be afforded.",
+            "All pairs; k is ignored. The reference for sets where it can be afforded.",
             frozenset(),
             baselines.exhaustive,
         ),
@@ -89,7 +104,7 @@ METHODS: dict[str, Method] = {
 
 
 def find_method(name: str | Path) -> Method:
-    """Return a method by name, or one that runs a checkpoint by path.
+    """Return a method by name, or one that runs a checkpoint or a file of descriptors by path.
 
     Raises:
         InputError: there is none of that name (suggests the nearest), or no such file.
@@ -98,6 +113,10 @@ def find_method(name: str | Path) -> Method:
     if text in METHODS:
         return METHODS[text]
     path = Path(text)
+    if path.suffix in DESCRIPTOR_SUFFIXES:
+        if not path.is_file():
+            raise InputError(f"The file of descriptors {path} does not exist.")
+        return _file_method(path)
     if path.is_file() or path.suffix in CHECKPOINT_SUFFIXES:
         file = deep.checkpoint_file(path)
         return _deep_method(file.stem, f"The checkpoint {file}.", file)

@@ -10,22 +10,20 @@ from __future__ import annotations
 import hashlib
 import tempfile
 import time
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_netvlad.cache.ranking import NO_PARTNER, Ranking
-from colmap_netvlad.colmap.database import copy_database, open_database
-from colmap_netvlad.project import Project
+from colmap_netvlad.colmap.copies import copy_database
+from colmap_netvlad.flight import Flight
 from colmap_netvlad.retrieval.methods.vlad import NO_FEATURES, sample_descriptors
+from colmap_netvlad.retrieval.options import RetrievalOptions
 from colmap_netvlad.runtime import progress
 from colmap_netvlad.runtime.errors import InputError
 from colmap_netvlad.runtime.files import atomic_path
-
-if TYPE_CHECKING:
-    from colmap_netvlad.retrieval.options import RetrievalOptions
 
 PUBLISHED = "vocab_tree_faiss_flickr100K_words256K.bin"
 PUBLISHED_SHA256 = "96ca8ec8ea60b1f73465aaf2c401fd3b3ca75cdba2d3c50d6a2f6f760f275ddc"
@@ -41,11 +39,11 @@ BUILD_ITERATIONS = 10
 stops after 10 iterations. That bounds its building to some minutes on 2 cores."""
 
 FULL_DEPTH = 2000
-"""Up to this many images every image ranks all others; above, at least as many as asked for
-and 1,000."""
+LEAST_DEPTH = 1000
+"""Up to 2,000 images every image ranks all others; above, at least 1,000."""
 
 
-def rank(project: Project, options: RetrievalOptions) -> Ranking:
+def candidates(flight: Flight, options: RetrievalOptions, depth: int) -> Ranking:
     """Rank by COLMAP's vocabulary tree.
 
     Works on a temporary copy of the features (disk space and time of one copy: about 0.7 MB an
@@ -53,28 +51,24 @@ def rank(project: Project, options: RetrievalOptions) -> Ranking:
     1 / rank.
 
     Raises:
-        InputError: no local features, no such tree, or a tree that COLMAP cannot read.
+        InputError: no SIFT features, no such tree, or a tree that COLMAP cannot read.
     """
-    with open_database(project.database) as database:
-        images = database.images()
-        described = database.descriptor_counts()
+    images, described = flight.images, flight.descriptors
     if not described:
         raise InputError(
-            f"{project.database} has no local features, which a vocabulary tree needs; extract "
-            "them with `colmap-netvlad features`."
+            f"{flight.project.database} has no SIFT features, which a vocabulary tree needs; "
+            "extract them with `colmap-netvlad features`."
         )
-    tree, note = find_tree(project, options.vocab_tree, options.seed)
+    tree, note = find_tree(flight, options.vocab_tree, options.seed)
     rows = {image.image_id: i for i, image in enumerate(images)}
-    depth = len(images) - 1
-    if len(images) > FULL_DEPTH:
-        depth = min(depth, max(options.k, 1000))
+    depth = len(images) - 1 if len(images) <= FULL_DEPTH else max(depth, LEAST_DEPTH)
     with tempfile.TemporaryDirectory(prefix="colmap-netvlad-") as folder:
         features = Path(folder) / "features.db"
-        copy_database(project.database, features, matches=False)
+        copy_database(flight.project.database, features, matches=False)
         partners, seconds_index, seconds_query = _query(features, tree, rows, described, depth)
     scores = 1 / np.arange(1, depth + 1, dtype=np.float32)
     return Ranking(
-        tuple(image.name for image in images),
+        flight.names,
         partners,
         np.where(partners == NO_PARTNER, -np.inf, scores).astype(np.float32),
         "bow",
@@ -85,7 +79,7 @@ def rank(project: Project, options: RetrievalOptions) -> Ranking:
     )
 
 
-def find_tree(project: Project, given: Path | None, seed: int) -> tuple[Path, str]:
+def find_tree(flight: Flight, given: Path | None, seed: int) -> tuple[Path, str]:
     """Return the vocabulary tree to use, and a sentence that says which it is.
 
     Raises:
@@ -97,28 +91,26 @@ def find_tree(project: Project, given: Path | None, seed: int) -> tuple[Path, st
     published = Path.home() / ".cache" / "colmap" / f"{PUBLISHED_SHA256}-{PUBLISHED}"
     if published.is_file():
         return published, f"COLMAP's published vocabulary tree {PUBLISHED}"
-    return _own_tree(project, seed)
+    return _own_tree(flight, seed)
 
 
-def _own_tree(project: Project, seed: int) -> tuple[Path, str]:
-    with open_database(project.database) as database:
-        counts = database.descriptor_counts()
-        total = sum(counts.values())
-        words = int(min(MOST_WORDS, max(total // DESCRIPTORS_A_WORD, 1)))
-        content = f"{sorted(counts.items())} {words} {seed}"
-        key = hashlib.sha256(content.encode()).hexdigest()[:12]
-        tree = project.cache.with_suffix(f".words-{key}.bin")
-        note = (
-            f"vocabulary tree of {words} words built from this project's own descriptors "
-            "(COLMAP's published tree is not in its cache)"
-        )
-        if tree.is_file():
-            return tree, note
-        sample = sample_descriptors(
-            database, list(counts), len(counts), words * DESCRIPTORS_A_WORD, seed
-        )
+def _own_tree(flight: Flight, seed: int) -> tuple[Path, str]:
+    counts, cache = flight.descriptors, flight.project.cache
+    words = int(min(MOST_WORDS, max(sum(counts.values()) // DESCRIPTORS_A_WORD, 1)))
+    content = f"{sorted(flight.features.items())} {words} {seed}"
+    key = hashlib.sha256(content.encode()).hexdigest()[:12]
+    tree = cache.with_suffix(f".words-{key}.bin")
+    note = (
+        f"vocabulary tree of {words} words built from this project's own descriptors "
+        "(COLMAP's published tree is not in its cache)"
+    )
+    if tree.is_file():
+        return tree, note
+    sample = sample_descriptors(
+        flight.database, list(counts), len(counts), words * DESCRIPTORS_A_WORD, seed
+    )
     start = time.perf_counter()
-    for old in tree.parent.glob(project.cache.with_suffix(".words-*.bin").name):
+    for old in tree.parent.glob(cache.with_suffix(".words-*.bin").name):
         old.unlink()
     _build(tree, sample.astype(np.float32), words, seed)
     return tree, f"{note}, in {time.perf_counter() - start:.0f} s"
@@ -148,7 +140,7 @@ def _build(tree: Path, sample: NDArray[np.float32], words: int, seed: int) -> No
 
 
 def _query(
-    features: Path, tree: Path, rows: dict[int, int], described: dict[int, int], depth: int
+    features: Path, tree: Path, rows: dict[int, int], described: Mapping[int, int], depth: int
 ) -> tuple[NDArray[np.int32], float, float]:
     """Index all images and query each; return partners (N, depth) and the seconds of both."""
     import pycolmap
@@ -182,7 +174,7 @@ def _query(
 def _keep(
     pairs: list[tuple[int, int]],
     rows: dict[int, int],
-    described: dict[int, int],
+    described: Mapping[int, int],
     partners: NDArray[np.int32],
 ) -> None:
     """Write one query's answer, (query, partner) best first, into its row."""

@@ -5,60 +5,80 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from colmap_netvlad.cache.cells import LocalFeatures
+from colmap_netvlad.cache.cells import Cells
+from colmap_netvlad.cache.photos import contents
 from colmap_netvlad.cache.ranking import Ranking
 from colmap_netvlad.cache.store import Store
-from colmap_netvlad.colmap.database import image_names
+from colmap_netvlad.flight import Flight
 from colmap_netvlad.models.catalogue import CATALOGUE
 from colmap_netvlad.photos.decode import load_batches
-from colmap_netvlad.photos.files import BadPhoto, photo_fingerprint
 from colmap_netvlad.photos.masks import find_mask
-from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval.described import cache_note, missing, rank_described
+from colmap_netvlad.retrieval.options import RetrievalOptions
 from colmap_netvlad.runtime.errors import InputError
 from colmap_netvlad.runtime.progress import step
-
-if TYPE_CHECKING:
-    from colmap_netvlad.retrieval.options import RetrievalOptions
 
 BATCH_SIZE = 8
 
 
-def rank(project: Project, name_or_path: str | Path, options: RetrievalOptions) -> Ranking:
-    """Rank by a model's descriptors; photos already described are not described again.
+def candidates(
+    flight: Flight, options: RetrievalOptions, depth: int, name_or_path: str | Path
+) -> Ranking:
+    """Rank by a model's descriptors; see `describe_photos`.
 
-    Local features for `retrieval.rerank` are kept with them where `options.rerank` is not 0.
-    Photos that cannot be used are left out: they have no partners and are listed with a reason.
+    Photos that cannot be used have no partners and are listed with a reason.
 
     Args:
-        project: its photo folder must be known.
+        flight: its photo folder must be known.
         name_or_path: a model of the catalogue, or a checkpoint file.
-        options: k, rerank, device, batch size, exact, seed.
 
     Raises:
         InputError: no photo folder, no weights, not a checkpoint, or no photo that can be used.
     """
-    folder = project.need_images()
-    checkpoint = checkpoint_file(name_or_path)
-    names = image_names(project.database)
-    with Store(project.cache) as store:
-        photos, left_out = fingerprints(folder, names, options.masks)
-        model = model_fingerprint(checkpoint)
-        to_do = missing(store, model, photos, local=options.rerank > 0)
-        bad = _describe(store, model, checkpoint, folder, to_do, photos, options)
-        left_out |= bad
-        if len(left_out) == len(names):
-            raise InputError(
-                f"None of the {len(names)} photos in {folder} can be used (first: {names[0]} "
-                f"{left_out[names[0]]}); mend --images."
-            )
-        note = cache_note(len(to_do) - len(bad), len(names) - len(left_out))
-        method = str(name_or_path) if str(name_or_path) in CATALOGUE else checkpoint.stem
-        return rank_described(store, model, names, left_out, options, method, [note])
+    key, left_out, note = describe_photos(flight, options, name_or_path)
+    method = Path(name_or_path).stem if Path(name_or_path).suffix else str(name_or_path)
+    return rank_described(flight.store, key, flight.names, left_out, options, depth, method, [note])
+
+
+def describe_photos(
+    flight: Flight, options: RetrievalOptions, name_or_path: str | Path
+) -> tuple[str, dict[str, str], str]:
+    """Describe the photos that the store does not have yet, as they are on disk now.
+
+    Cells for `retrieval.rerank` are kept with the descriptors where `options.rerank` is not 0.
+
+    Returns:
+        What the store keeps them under; name -> reason of the photos that cannot be used; a
+        sentence on what was computed.
+
+    Raises:
+        InputError: as `candidates`.
+    """
+    folder, names = flight.project.need_images(), flight.names
+    photos, left_out = _contents(flight.store, folder, names, options.masks)
+    key = cells_key(name_or_path, options)
+    to_do = missing(flight.store, key, photos, cells=options.rerank > 0)
+    bad = _describe(
+        flight.store, key, checkpoint_file(name_or_path), folder, to_do, photos, options
+    )
+    left_out |= bad
+    if len(left_out) == len(names):
+        raise InputError(
+            f"None of the {len(names)} photos in {folder} can be used (first: {names[0]} "
+            f"{left_out[names[0]]}); mend `images`."
+        )
+    return key, left_out, cache_note(len(to_do) - len(bad), len(names) - len(left_out))
+
+
+def cells_key(name_or_path: str | Path, options: RetrievalOptions) -> str:
+    """Return what the store keeps a model's descriptors and cells under.
+
+    Photos seen through masks are kept beside the whole ones.
+    """
+    model = model_fingerprint(checkpoint_file(name_or_path))
+    return model if options.masks is None else f"{model}-masked"
 
 
 def checkpoint_file(name_or_path: str | Path) -> Path:
@@ -82,35 +102,31 @@ def model_fingerprint(checkpoint: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def fingerprints(
-    folder: Path, names: Sequence[str], masks: Path | None = None
+def _contents(
+    store: Store, folder: Path, names: Sequence[str], masks: Path | None
 ) -> tuple[dict[str, str], dict[str, str]]:
     """Return (name -> content fingerprint) and (name -> reason) of photos that have none.
 
-    A photo seen through a mask is another content.
+    A photo seen through another mask is another content.
     """
-
-    def one(name: str) -> tuple[str, str]:
-        try:
-            photo = photo_fingerprint(folder / name)
-            mask = find_mask(masks, name) if masks is not None else None
-            return photo if mask is None else f"{photo}-{photo_fingerprint(mask)}", ""
-        except BadPhoto as fault:
-            return "", str(fault)
-
-    photos, bad = {}, {}
-    with ThreadPoolExecutor() as pool:
-        for name, (fingerprint, reason) in zip(names, pool.map(one, names), strict=True):
-            if reason:
-                bad[name] = reason
-            else:
-                photos[name] = fingerprint
+    photos, bad = contents(store, {name: folder / name for name in names})
+    if masks is not None:
+        found = {name: find_mask(masks, name) for name in photos}
+        files = {f"mask of {name}": mask for name, mask in found.items() if mask is not None}
+        seen, unreadable = contents(store, files)
+        for name in list(photos):
+            key = f"mask of {name}"
+            if key in unreadable:
+                del photos[name]
+                bad[name] = f"has a mask that {unreadable[key]}"
+            elif key in seen:
+                photos[name] += f"-{seen[key]}"
     return photos, bad
 
 
 def _describe(
     store: Store,
-    model: str,
+    key: str,
     checkpoint: Path,
     folder: Path,
     names: Sequence[str],
@@ -136,11 +152,11 @@ def _describe(
         for batch in batches:
             bad |= dict(batch.bad)
             if batch.names:
-                vectors, maps = network.describe_with_local(batch.pixels)
-                local = [LocalFeatures.of(features) for features in maps] if options.rerank else []
+                vectors, maps = network.describe_with_cells(batch.pixels)
+                cells = [Cells.of(features) for features in maps] if options.rerank else []
                 done = time.perf_counter()
-                contents = [photos[name] for name in batch.names]
-                store.add_descriptors(model, batch.names, contents, vectors, done - start, local)
+                seen = [photos[name] for name in batch.names]
+                store.add_descriptors(key, batch.names, seen, vectors, done - start, cells)
                 # Waiting for the decoders belongs to the next batch's time.
                 start = done
             bar.advance(len(batch.names) + len(batch.bad))

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 from colmap_netvlad.cache.ranking import Ranking
+from colmap_netvlad.flight import Flight
 from colmap_netvlad.models.catalogue import DEFAULT
-from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval.fusion import expand, fuse, ranking_of
 from colmap_netvlad.retrieval.methods import deep, vlad
-
-if TYPE_CHECKING:
-    from colmap_netvlad.retrieval.options import RetrievalOptions
+from colmap_netvlad.retrieval.options import RetrievalOptions
 
 DEEP_WEIGHT = 1.5
 VLAD_WEIGHT = 1.0
@@ -24,33 +21,27 @@ EXPANSION_NEIGHBOURS = 8
 EXPANSION_SHARE = 0.3
 """Query expansion, chosen with them."""
 
-LEAST_DEPTH = 200
-"""Partners each ranking is asked for at least: what one ranking does not list cannot be fused."""
 
-DEPTH_FACTOR = 4
-"""... and at least this many times k."""
-
-
-def rank(project: Project, options: RetrievalOptions) -> Ranking:
+def candidates(flight: Flight, options: RetrievalOptions, depth: int) -> Ranking:
     """Rank candidates by the sum of the deep model's and VLAD's similarity, with query expansion.
 
     Args:
-        project: its database has SIFT features, and its photo folder is known.
-        options: k; `model` names another deep model than the default.
+        flight: its database has SIFT features, and its photo folder is known.
+        options: `model` names another deep model than the default.
+        depth: partners of each image, of both rankings and of their sum.
 
     Raises:
         InputError: no features, no photos, or no usable weights.
     """
-    deeper = replace(options, k=fusion_depth(options.k))
-    rankings = [deep.rank(project, options.model or DEFAULT, deeper), vlad.rank(project, deeper)]
+    rankings = [
+        deep.candidates(flight, options, depth, options.model or DEFAULT),
+        vlad.candidates(flight, options, depth),
+    ]
     start = time.perf_counter()
     similarity = expand(
-        fuse(rankings, [DEEP_WEIGHT, VLAD_WEIGHT]),
-        EXPANSION_NEIGHBOURS,
-        EXPANSION_SHARE,
-        deeper.k,
+        fuse(rankings, [DEEP_WEIGHT, VLAD_WEIGHT]), EXPANSION_NEIGHBOURS, EXPANSION_SHARE, depth
     )
-    fused = ranking_of(similarity, rankings[0].names, "hybrid", options.k)
+    fused = ranking_of(similarity, flight.names, "hybrid", depth)
     seconds = time.perf_counter() - start
     return replace(
         fused,
@@ -59,11 +50,6 @@ def rank(project: Project, options: RetrievalOptions) -> Ranking:
         notes=tuple(f"{r.method}: {note}" for r in rankings for note in r.notes),
         left_out=_left_out_of_all(rankings),
     )
-
-
-def fusion_depth(k: int) -> int:
-    """How deep the rankings to be fused must go for k partners."""
-    return max(LEAST_DEPTH, DEPTH_FACTOR * k)
 
 
 def _left_out_of_all(rankings: list[Ranking]) -> tuple[tuple[str, str], ...]:

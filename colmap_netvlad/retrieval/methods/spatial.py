@@ -6,21 +6,16 @@ Heights are ignored (COLMAP's default), so that flights at different heights sti
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from colmap_netvlad.cache.ranking import NO_PARTNER, Ranking
-from colmap_netvlad.colmap.database import image_names
-from colmap_netvlad.flight import read_positions
-from colmap_netvlad.project import Project
+from colmap_netvlad.flight import Flight
+from colmap_netvlad.retrieval.options import RetrievalOptions
 from colmap_netvlad.runtime.errors import InputError
 
-if TYPE_CHECKING:
-    from colmap_netvlad.retrieval.options import RetrievalOptions
 
-
-def rank(project: Project, options: RetrievalOptions) -> Ranking:
+def candidates(flight: Flight, options: RetrievalOptions, depth: int) -> Ranking:
     """Rank by distance on the ground; images without a position have no partners.
 
     Scores are negative distances, in metres for GPS, else in the priors' unit.
@@ -31,17 +26,16 @@ def rank(project: Project, options: RetrievalOptions) -> Ranking:
     from scipy.spatial import cKDTree
 
     start = time.perf_counter()
-    names = image_names(project.database)
-    positions = read_positions(project)
+    names, positions = flight.names, flight.positions
     seconds_describe = time.perf_counter() - start
     known = np.flatnonzero(positions.known).astype(np.int32)
     if not positions.useful:
         raise InputError(
-            f"{len(known)} of {len(names)} images have a usable position (from {project.database} "
-            "and the photos' EXIF); use a method that goes by appearance."
+            f"{len(known)} of {len(names)} images have a usable position (from "
+            f"{flight.project.database} and the photos' EXIF); use one that goes by appearance."
         )
     start = time.perf_counter()
-    k = min(options.k, len(known) - 1)
+    k = min(depth, len(known) - 1)
     ground = positions.metres[known, :2]
     distances, found = cKDTree(ground).query(ground, k=k + 1)
     partners = np.full((len(names), k), NO_PARTNER, np.int32)

@@ -9,21 +9,18 @@ from __future__ import annotations
 
 import hashlib
 import time
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_netvlad.cache.ranking import Ranking
 from colmap_netvlad.cache.store import Store
-from colmap_netvlad.colmap.database import Database, open_database
-from colmap_netvlad.project import Project
+from colmap_netvlad.colmap.database import Database
+from colmap_netvlad.flight import Flight
 from colmap_netvlad.retrieval.described import cache_note, missing, rank_described
+from colmap_netvlad.retrieval.options import RetrievalOptions
 from colmap_netvlad.runtime.errors import InputError
 from colmap_netvlad.runtime.progress import step
-
-if TYPE_CHECKING:
-    from colmap_netvlad.retrieval.options import RetrievalOptions
 
 WORDS = 256
 """Size of the codebook in the paper's section 4.2."""
@@ -37,40 +34,34 @@ OUTGROWN = 1.5
 """The codebook is learned again when the project has this many times the images it had."""
 
 BATCH = 64
-NO_FEATURES = "has no local features"
+NO_FEATURES = "has no SIFT features"
 
 
-def rank(project: Project, options: RetrievalOptions) -> Ranking:
+def candidates(flight: Flight, options: RetrievalOptions, depth: int) -> Ranking:
     """Rank by VLAD of the SIFT features in the database.
 
     Raises:
         InputError: the database has no features, or not SIFT.
     """
-    with open_database(project.database) as database, Store(project.cache) as store:
-        images = database.images()
-        names = [image.name for image in images]
-        counts = database.descriptor_counts()
-        ids = {image.name: image.image_id for image in images if image.image_id in counts}
-        if not ids:
-            raise InputError(
-                f"{project.database} has no local features, which VLAD needs; extract them with "
-                "`colmap-netvlad features`."
-            )
-        start = time.perf_counter()
-        words, learned = _codebook(store, database, list(ids.values()), options.seed)
-        seconds_codebook = time.perf_counter() - start
-        model = "vlad-" + hashlib.sha256(words.tobytes()).hexdigest()
-        features = {
-            name: _features_fingerprint(database.sift_descriptors(image_id))
-            for name, image_id in ids.items()
-        }
-        to_do = missing(store, model, features)
-        _describe(store, database, model, words, ids, features, to_do)
-        left_out = {name: NO_FEATURES for name in names if name not in ids}
-        notes = [cache_note(len(to_do), len(ids))]
-        if learned:
-            notes.append(f"codebook of {len(words)} words learned in {seconds_codebook:.1f} s")
-        return rank_described(store, model, names, left_out, options, "vlad", notes)
+    database, store = flight.database, flight.store
+    ids = {i.name: i.image_id for i in flight.images if i.image_id in flight.descriptors}
+    if not ids:
+        raise InputError(
+            f"{flight.project.database} has no SIFT features, which VLAD needs; extract them with "
+            "`colmap-netvlad features`."
+        )
+    start = time.perf_counter()
+    words, learned = _codebook(store, database, list(ids.values()), options.seed)
+    seconds_codebook = time.perf_counter() - start
+    model = "vlad-" + hashlib.sha256(words.tobytes()).hexdigest()
+    features = {name: flight.features[image_id] for name, image_id in ids.items()}
+    to_do = missing(store, model, features)
+    _describe(store, database, model, words, ids, features, to_do)
+    left_out = {name: NO_FEATURES for name in flight.names if name not in ids}
+    notes = [cache_note(len(to_do), len(ids))]
+    if learned:
+        notes.append(f"codebook of {len(words)} words learned in {seconds_codebook:.1f} s")
+    return rank_described(store, model, flight.names, left_out, options, depth, "vlad", notes)
 
 
 def describe(descriptors: NDArray[np.uint8], words: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -161,10 +152,6 @@ def _describe(
             seconds = time.perf_counter() - start
             store.add_descriptors(model, names, [features[n] for n in names], vectors, seconds)
             bar.advance(len(names))
-
-
-def _features_fingerprint(descriptors: NDArray[np.uint8]) -> str:
-    return hashlib.sha1(descriptors.tobytes(), usedforsecurity=False).hexdigest()
 
 
 def _nearest_words(values: NDArray[np.float32], words: NDArray[np.float32]) -> NDArray[np.intp]:

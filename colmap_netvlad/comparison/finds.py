@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass
 
-from colmap_netvlad.compare.evidence import Evidence
-from colmap_netvlad.compare.result import CHANCE, EXHAUSTIVE
+from colmap_netvlad.comparison.evidence import Evidence
+from colmap_netvlad.comparison.result import CHANCE, EXHAUSTIVE
 from colmap_netvlad.graph.pair import Pair
 from colmap_netvlad.graph.verified import CORRECT_MATCHES
 

@@ -1,6 +1,6 @@
 """The settings of a training run as options of the command line.
 
-Made from `options.TrainOptions` when `train` is called, so that other commands stay fast.
+Made from `training.options.TrainOptions` when `train` is called, so that other commands stay fast.
 """
 
 from __future__ import annotations
@@ -11,11 +11,13 @@ from typing import TYPE_CHECKING, Any
 import click
 from click.core import ParameterSource
 
+from colmap_netvlad.terminal import Command
+
 if TYPE_CHECKING:
     from colmap_netvlad.training.options import TrainOptions
 
 
-class SettingsCommand(click.Command):
+class SettingsCommand(Command):
     """A command that also takes every setting of `TrainOptions`, as `--name-of-setting`."""
 
     def get_params(self, ctx: click.Context) -> list[click.Parameter]:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-import math
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from colmap_netvlad.runtime.errors import InputError
 from colmap_netvlad.runtime.files import write_atomically
+from colmap_netvlad.runtime.plain import plain
 
 FORMAT = 2
 """Version of `compare.json`."""
@@ -184,8 +184,8 @@ def write_json(path: Path, comparison: Comparison) -> None:
     Raises:
         InputError: the file cannot be written.
     """
-    content = {"format": FORMAT, **asdict(comparison)}
-    text = json.dumps(_null_for_nan(content), indent=1, ensure_ascii=False)
+    content = {"format": FORMAT, **plain(comparison)}
+    text = json.dumps(content, indent=1, ensure_ascii=False)
     write_atomically(path, text + "\n")
 
 
@@ -220,13 +220,3 @@ def _method(row: dict[str, Any]) -> MethodResult:
             "model": None if model is None else ModelFigures(**model),
         }
     )
-
-
-def _null_for_nan(value: Any) -> Any:
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, dict):
-        return {key: _null_for_nan(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_null_for_nan(item) for item in value]
-    return value

@@ -10,13 +10,13 @@ from dataclasses import dataclass, replace
 import networkx as nx
 import pycolmap
 
-from colmap_netvlad import __version__, metrics
+from colmap_netvlad import metrics
 from colmap_netvlad.cache.ranking import Ranking
-from colmap_netvlad.compare import pool
-from colmap_netvlad.compare.evidence import Evidence
-from colmap_netvlad.compare.finds import single_finds
-from colmap_netvlad.compare.models import read_plan
-from colmap_netvlad.compare.result import (
+from colmap_netvlad.comparison import pool
+from colmap_netvlad.comparison.evidence import Evidence
+from colmap_netvlad.comparison.finds import single_finds
+from colmap_netvlad.comparison.models import read_plan
+from colmap_netvlad.comparison.result import (
     EXHAUSTIVE,
     UNION,
     Comparison,
@@ -24,12 +24,12 @@ from colmap_netvlad.compare.result import (
     ModelFigures,
     RetrievalFigures,
 )
-from colmap_netvlad.compare.workspace import ProjectFacts, Workspace
-from colmap_netvlad.flight import read_positions
+from colmap_netvlad.comparison.workspace import Workspace
+from colmap_netvlad.flight import Flight
 from colmap_netvlad.graph.pair import Pair
 from colmap_netvlad.graph.verified import correct_pairs, verified_by_name
-from colmap_netvlad.project import Project
 from colmap_netvlad.runtime.machine import usable_processors
+from colmap_netvlad.runtime.version import VERSION
 
 FULL_RANKING = 1000
 """Up to this many images every method ranks all others, so that average precision is the
@@ -54,9 +54,8 @@ class Candidate:
 
 
 def gather_evidence(
-    project: Project,
+    flight: Flight,
     workspace: Workspace,
-    facts: ProjectFacts,
     candidates: Sequence[Candidate],
     pairs: Mapping[str, set[Pair]],
 ) -> Evidence:
@@ -78,21 +77,20 @@ def gather_evidence(
         if c.model and not c.model.failed
     }
     return Evidence(
-        names=facts.names,
-        images=project.images,
+        names=flight.names,
+        images=flight.project.images,
         partners={c.name: c.ranking.partners for c in candidates if c.ranking and c.ranks},
         pairs=pairs,
         verified=verified,
         truth=correct_pairs(verified),
-        positions=read_positions(project).metres,
+        positions=flight.positions.metres,
         plans={name: plan for name, plan in plans.items() if plan is not None},
     )
 
 
 def compute_figures(
-    project: Project,
+    flight: Flight,
     workspace: Workspace,
-    facts: ProjectFacts,
     candidates: Sequence[Candidate],
     pairs: Mapping[int, Mapping[str, set[Pair]]],
     evidence: Evidence,
@@ -107,8 +105,8 @@ def compute_figures(
     widest = pairs[ks[-1]]
     seconds = workspace.pair_seconds()
     reference = EXHAUSTIVE if EXHAUSTIVE in widest else UNION
-    full = reference == EXHAUSTIVE and len(facts.names) <= FULL_RANKING
-    depth = len(facts.names) - 1 if full else ks[-1]
+    full = reference == EXHAUSTIVE and len(flight.names) <= FULL_RANKING
+    depth = len(flight.names) - 1 if full else ks[-1]
     found = {name: len(finds) for name, finds in single_finds(evidence).items()}
     methods = []
     for candidate in candidates:
@@ -132,10 +130,10 @@ def compute_figures(
             )
         methods.append(result)
     return Comparison(
-        project=project.database.name,
-        images=len(facts.names),
-        images_without_features=sum(count == 0 for count in facts.keypoints),
-        keypoints=sum(facts.keypoints),
+        project=flight.project.database.name,
+        images=len(flight.names),
+        images_without_features=len(flight.images) - len(flight.keypoints),
+        keypoints=sum(flight.keypoints.values()),
         ks=ks,
         seed=seed,
         reference=reference,
@@ -176,7 +174,7 @@ def _left_out(ranking: Ranking) -> list[str]:
 
 def _versions() -> dict[str, str]:
     return {
-        "colmap-netvlad": __version__,
+        "colmap-netvlad": VERSION,
         "pycolmap": pycolmap.__version__,
         "Processor": f"{platform.machine()}, {usable_processors()} cores",
     }

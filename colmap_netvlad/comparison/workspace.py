@@ -1,7 +1,7 @@
 """The folder of a comparison: what is kept there so that a killed run goes on where it stopped.
 
 compare.html, compare.json, compare.csv   the result
-work/project.json     which project this is: a fingerprint of image names and feature counts
+work/project.json     which project this is: a fingerprint of image names and features
 work/methods.json     the methods asked for so far
 work/union.db         the project's features, and every distinct pair matched once
 work/seconds.db       what matching each pair took
@@ -17,60 +17,45 @@ import re
 import sqlite3
 from collections.abc import Iterable, Sequence
 from contextlib import closing
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from colmap_netvlad.cache.ranking import Ranking
-from colmap_netvlad.colmap.database import copy_database, open_database
+from colmap_netvlad.colmap.copies import copy_database
+from colmap_netvlad.flight import Flight
 from colmap_netvlad.graph.pair import Pair
 from colmap_netvlad.runtime.errors import InputError
 from colmap_netvlad.runtime.files import atomic_path, write_atomically
 
 
-@dataclass(frozen=True)
-class ProjectFacts:
-    """What is compared on.
-
-    Attributes:
-        names: N image names in the database's order.
-        keypoints: N numbers of local features, 0 where an image has none.
-    """
-
-    names: tuple[str, ...]
-    keypoints: tuple[int, ...]
-
-    @property
-    def fingerprint(self) -> str:
-        """Sha256 of image names and feature counts: other photos or features, other project."""
-        rows = zip(self.names, self.keypoints, strict=True)
-        text = "\n".join(f"{name}\t{count}" for name, count in rows)
-        return hashlib.sha256(text.encode("utf-8")).hexdigest()
-
-
-def read_facts(database: Path) -> ProjectFacts:
-    """Read the images and feature counts of a project.
+def check_comparable(flight: Flight) -> None:
+    """Make sure that methods can be compared on a flight.
 
     Raises:
-        InputError: it has no two images, or no image has local features.
+        InputError: it has no two images, or no image has features.
     """
-    with open_database(database) as opened:
-        images = opened.images()
-        counts = opened.keypoint_counts()
-    if len(images) < 2:
+    database, count = flight.project.database, len(flight.images)
+    if count < 2:
         raise InputError(
-            f"{database} has {len(images)} image{'s' if len(images) != 1 else ''}; a comparison "
-            "needs two at least. Import photos with `colmap-netvlad features`."
+            f"{database} has {count} image{'s' if count != 1 else ''}; a comparison needs two at "
+            "least. Import photos with `colmap-netvlad features`."
         )
-    if not counts:
+    if not flight.keypoints:
         raise InputError(
-            f"{database} has no local features, so no pair can be verified; extract them with "
+            f"{database} has no features, so no pair can be verified; extract them with "
             "`colmap-netvlad features`."
         )
-    return ProjectFacts(
-        tuple(row.name for row in images), tuple(counts.get(row.image_id, 0) for row in images)
+
+
+def flight_fingerprint(flight: Flight) -> str:
+    """Return the sha256 of image names and features: other photos or features, other flight."""
+    rows = (
+        f"{image.name}\t{flight.keypoints.get(image.image_id, 0)}"
+        f"\t{flight.features.get(image.image_id, '')}"
+        for image in flight.images
     )
+    return hashlib.sha256("\n".join(rows).encode("utf-8")).hexdigest()
 
 
 class Workspace:
@@ -185,27 +170,28 @@ class Workspace:
         return ledger
 
 
-def open_workspace(folder: Path, database: Path, facts: ProjectFacts) -> Workspace:
+def open_workspace(folder: Path, flight: Flight) -> Workspace:
     """Make a comparison's folder, or go on in an earlier one of the same project.
 
     Raises:
         InputError: the folder is another project's or holds something else, the database's
             photos or features have changed since, or the folder cannot be written.
     """
-    workspace = Workspace(folder)
+    workspace, database = Workspace(folder), flight.project.database
+    fingerprint = flight_fingerprint(flight)
     if workspace.project.is_file():
         kept = json.loads(workspace.project.read_text(encoding="utf-8"))
-        if kept.get("fingerprint") != facts.fingerprint:
+        if kept.get("fingerprint") != fingerprint:
             raise InputError(
                 f"{folder} holds a comparison of another project ({kept.get('database')}), or its "
-                "photos or features have changed since; name another folder with --output."
+                "photos or features have changed since; name another folder with `output`."
             )
     elif folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(
-            f"{folder} exists and is no comparison's folder; name another with --output."
+            f"{folder} exists and is no comparison's folder; name another with `output`."
         )
     else:
-        text = json.dumps({"database": str(database), "fingerprint": facts.fingerprint}, indent=1)
+        text = json.dumps({"database": str(database), "fingerprint": fingerprint}, indent=1)
         write_atomically(workspace.project, text + "\n")
     if not workspace.union.exists():
         copy_database(database, workspace.union, matches=False)

@@ -5,25 +5,21 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-import sqlite3
 import time
 from collections.abc import Collection
-from contextlib import closing
 from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 
-from colmap_netvlad.colmap.database import open_database, pair_id
-from colmap_netvlad.compare.evidence import Plan
-from colmap_netvlad.compare.result import ModelFigures
+from colmap_netvlad.colmap.copies import copy_with_pairs
+from colmap_netvlad.comparison.evidence import Plan
+from colmap_netvlad.comparison.result import ModelFigures
 from colmap_netvlad.graph.pair import Pair
 from colmap_netvlad.mapping.incremental import map_incremental
 from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.mapping.summary import summarize
 from colmap_netvlad.runtime.files import atomic_path, write_atomically
-
-MATCH_TABLES = ("matches", "two_view_geometries")
 
 FIGURES = "figures.json"
 """Written last: a folder that has it is complete."""
@@ -55,7 +51,7 @@ def reconstruct_once(
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     database = folder / "database.db"
-    copy_pairs(union, database, pairs)
+    copy_with_pairs(union, database, pairs)
     start = time.perf_counter()
     models = map_incremental(database, images, folder / "sparse", options)
     seconds = time.perf_counter() - start
@@ -99,33 +95,6 @@ def read_plan(folder: Path) -> Plan | None:
     with np.load(path, allow_pickle=False) as kept:
         names = tuple(kept["names"].tolist())
         return Plan(names, kept["centres"], kept["points"], kept["colours"])
-
-
-def copy_pairs(union: Path, target: Path, pairs: Collection[Pair]) -> None:
-    """Copy a database with the matches of these pairs only.
-
-    Local descriptors are left out: mapping does not read them, and they are most of the file.
-    """
-    with open_database(union) as opened:
-        ids = {row.name: row.image_id for row in opened.images()}
-    wanted = [(pair_id(ids[a], ids[b]),) for a, b in sorted(pairs)]
-    with atomic_path(target) as temporary, closing(sqlite3.connect(temporary)) as copy:
-        copy.execute("ATTACH ? AS whole", (str(union),))
-        schema = copy.execute(
-            "SELECT type, name, sql FROM whole.sqlite_master"
-            " WHERE sql IS NOT NULL AND name NOT LIKE 'sqlite_%' ORDER BY type = 'table' DESC"
-        ).fetchall()
-        copy.execute("CREATE TEMP TABLE wanted (pair_id INTEGER PRIMARY KEY)")
-        copy.executemany("INSERT INTO wanted VALUES (?)", wanted)
-        for kind, table, statement in schema:
-            copy.execute(statement)
-            if kind != "table" or table == "descriptors":
-                continue
-            own = " WHERE pair_id IN (SELECT pair_id FROM wanted)" if table in MATCH_TABLES else ""
-            copy.execute(f'INSERT INTO main."{table}" SELECT * FROM whole."{table}"{own}')
-        version = copy.execute("PRAGMA whole.user_version").fetchone()[0]
-        copy.execute(f"PRAGMA main.user_version = {version}")
-        copy.commit()
 
 
 def _save_plan(path: Path, model: object) -> None:

@@ -8,7 +8,7 @@ from collections.abc import Collection, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 
 from colmap_netvlad.colmap.database import open_database
-from colmap_netvlad.compare.workspace import Workspace
+from colmap_netvlad.comparison.workspace import Workspace
 from colmap_netvlad.graph.pair import Pair, as_pair
 from colmap_netvlad.matching.run import MatchOptions, match_pairs
 from colmap_netvlad.runtime import progress
