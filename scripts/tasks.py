@@ -13,17 +13,19 @@ the standard library is needed. PYTHON=/path/to/python names another interpreter
 environments that are made.
 
 Exit codes: 0; that of the step that failed; of `audit`: 0 no known vulnerability, 1 some (listed),
-2 not known, since the database of vulnerabilities could not be asked (offline).
+2 the database of vulnerabilities could not be asked (offline), or not about all libraries.
 """
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 VENV = ROOT / ".venv"
@@ -33,8 +35,8 @@ CORE = [
     f"tests/test_{name}.py"
     for name in (
         "packaging", "store", "database", "search", "partners", "rerank", "pairs_command",
-        "features", "positions", "models_checkpoint", "matching", "match_rounds", "viewgraph",
-        "partition", "merge", "reconstruct", "add", "report", "losses", "real_colmap",
+        "face", "features", "positions", "models_checkpoint", "matching", "match_rounds",
+        "viewgraph", "partition", "merge", "reconstruct", "add", "report", "losses", "real_colmap",
     )
 ]  # fmt: skip
 """What is run on the lowest versions: each library's use, on the rendered flight."""
@@ -116,25 +118,38 @@ def audit(arguments: list[str]) -> int:
         try:
             install(venv, "pip-audit")
         except subprocess.CalledProcessError:
-            return not_audited("pip-audit could not be installed")
-        listed = ["--no-deps", "--requirement", "constraints.txt"]
+            return verdict(None)
+        # The pins are all there is, so nothing is installed or resolved.
+        pins = ["--no-deps", "--disable-pip", "--requirement", "constraints.txt"]
+        program = [python_of(venv), "-m", "pip_audit", "--progress-spinner", "off"]
         done = subprocess.run(
-            [python_of(venv), "-m", "pip_audit", "--progress-spinner", "off", *listed, *arguments],
-            capture_output=True,
-            text=True,
+            [*program, "--format", "json", *pins, *arguments], capture_output=True, text=True
         )
-    print(done.stdout, end="")
-    # pip-audit exits with 1 for a vulnerability and for every fault of its own alike.
-    if done.returncode and "vulnerabilit" not in done.stderr:
-        said = done.stderr.strip().splitlines()
-        return not_audited(said[-1] if said else "pip-audit failed without a word")
-    print(done.stderr, end="", file=sys.stderr)
-    return done.returncode
+    if not done.stdout.strip():
+        print(done.stderr, end="", file=sys.stderr)
+        return verdict(None)
+    return verdict(json.loads(done.stdout))
 
 
-def not_audited(why: str) -> int:
-    print(f"Nothing was audited, perhaps for want of a network: {why}.", file=sys.stderr)
-    return 2
+def verdict(report: dict[str, list[dict[str, Any]]] | None) -> int:
+    """Print what pip-audit's JSON says, and return the exit code; None: there is no answer.
+
+    pip-audit itself calls it a success where it could ask about no library at all.
+    """
+    libraries = report["dependencies"] if report else []
+    skipped = [library["name"] for library in libraries if "skip_reason" in library]
+    known = [(library, fault) for library in libraries for fault in library.get("vulns", [])]
+    for library, fault in known:
+        mended = " or ".join(fault["fix_versions"]) or "nowhere yet"
+        print(f"{library['name']} {library['version']}: {fault['id']}, mended in {mended}")
+    print(f"{len(libraries) - len(skipped)} libraries audited, {len(known)} vulnerabilities known.")
+    if skipped or not libraries:
+        print(
+            "The database of vulnerabilities (pypi.org) could not be asked about "
+            f"{', '.join(skipped) or 'anything'}; try again with a connection to it.",
+            file=sys.stderr,
+        )
+    return 1 if known else 2 if skipped or not libraries else 0
 
 
 def make_venv(venv: Path, oldest: bool = False) -> None:

@@ -3,7 +3,7 @@
 import numpy as np
 import pycolmap
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from colmap_netvlad.mapping.merge import (
@@ -156,6 +156,7 @@ def test_a_refused_sub_model_is_tried_again_when_more_is_joined() -> None:
 
 @settings(deadline=None, max_examples=20)
 @given(st.floats(0.01, 100), st.integers(0, 10**6), st.floats(0, 0.5))
+@example(1.0, 111264, 0.140625)
 def test_similarity_is_found_for_any_scale_in_spite_of_outliers(scale, seed, outliers) -> None:
     rng = np.random.default_rng(seed)
     turn = pycolmap.Rotation3d(rng.normal(size=4))

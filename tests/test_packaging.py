@@ -137,3 +137,31 @@ def test_an_unknown_task_prints_the_list(
 ) -> None:
     assert tasks.main(["deploy"]) == 2
     assert "scripts/tasks.py wheel" in capsys.readouterr().err
+
+
+SOUND = {"name": "numpy", "version": "2.4.6", "vulns": []}
+FAULT = {"id": "CVE-2026-1", "fix_versions": ["13.0.1"]}
+FAULTY = {"name": "pillow", "version": "13.0.0", "vulns": [FAULT]}
+SKIPPED = {"name": "torch", "skip_reason": "not found on PyPI"}
+
+
+@pytest.mark.parametrize(
+    ("libraries", "code", "said"),
+    [
+        ([SOUND], 0, "1 libraries audited, 0 vulnerabilities known"),
+        ([SOUND, FAULTY, SKIPPED], 1, "pillow 13.0.0: CVE-2026-1, mended in 13.0.1"),
+        ([SOUND, SKIPPED], 2, "could not be asked about torch"),
+        ([SKIPPED, SKIPPED], 2, "0 libraries audited"),
+        (None, 2, "could not be asked about anything"),
+    ],
+)
+def test_an_audit_that_asked_nothing_is_no_clean_one(
+    libraries: list[dict[str, object]] | None,
+    code: int,
+    said: str,
+    tasks: ModuleType,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    report = None if libraries is None else {"dependencies": libraries, "fixes": []}
+    assert tasks.verdict(report) == code
+    assert said in "".join(capsys.readouterr())

@@ -18,6 +18,9 @@ from numpy.typing import NDArray
 MIN_SHARED_POINTS = 20
 """Fewer shared 3D points than this do not carry a similarity transform."""
 
+REFINEMENTS = 3
+"""Least squares over the points that agree, after a sample was found that they agree with."""
+
 MIN_INLIER_SHARE = 0.3
 """At least this share of the shared points must agree, or the sub-model is an outlier."""
 
@@ -181,6 +184,13 @@ def similarity(
         raise Refused(f"no similarity agrees with its {len(pairs)} shared points")
     base_from_other: pycolmap.Sim3d = found["tgt_from_src"]
     inliers = agreeing(base, other, pairs, base_from_other)
+    for _ in range(REFINEMENTS):
+        # The sample that won lies anywhere within the tolerance; all that agree say it best.
+        refined = pycolmap.estimate_sim3d(source[inliers], target[inliers])
+        if refined is None:
+            break
+        base_from_other = refined
+        inliers = agreeing(base, other, pairs, base_from_other)
     if inliers.mean() < MIN_INLIER_SHARE:
         raise Refused(f"only {inliers.mean():.0%} of its {len(pairs)} shared points agree")
     agreed = target[inliers]
