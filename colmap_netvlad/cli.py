@@ -156,6 +156,13 @@ def features(images: Path, database: Path, features: FeatureOptions, masks: Path
     show_default=True,
     help="Pair each photo with this many that follow it by name too (video, flight lines).",
 )
+@click.option(
+    "--across",
+    type=click.IntRange(min=0),
+    default=0,
+    show_default=True,
+    help="Pair each photo with this many of other flights too: of another folder, day or camera.",
+)
 @click.option("--join", "own_pairs", type=FILE, help="A pairs list of your own to join in.")
 @click.option(
     "--connect/--no-connect",
@@ -179,6 +186,7 @@ def pairs(
     output: Path | None,
     other_cameras: float,
     sequential: int,
+    across: int,
     own_pairs: Path | None,
     connect: bool,
     export: Path | None,
@@ -202,7 +210,7 @@ def pairs(
         replace(retrieval, k=k),
         format,
         output,
-        PartnerRules(other_cameras, sequential, own_pairs),
+        PartnerRules(other_cameras, sequential, own_pairs, across),
         connect,
         export,
     )

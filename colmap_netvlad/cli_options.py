@@ -267,8 +267,8 @@ FEATURES: tuple[Callable[[Any], Any], ...] = (
         "--camera",
         default="auto",
         show_default=True,
-        help="Which photos share a camera: auto (equal make, model, focal length and size; without"
-        " EXIF equal folder and size), single, per-folder, per-image.",
+        help="Which photos share a camera: auto (equal make, model, serial number, focal length and"
+        " size; without EXIF equal folder and size), single, per-folder, per-image.",
     ),
     click.option(
         "--camera-model",

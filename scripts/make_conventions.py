@@ -42,7 +42,7 @@ def draw_world(axes: Axes3D) -> None:
     outline(axes, ground, "tab:orange")
     for corner in ground:
         line(axes, np.array([centre, corner]), "tab:orange", 0.6)
-    axes.text(*ground[0], "footprint", color="tab:orange", fontsize=8)
+    axes.text(*(ground[0] + [-0.1, -0.25, 0]), "footprint", color="tab:orange", fontsize=8)
     frame(axes)
 
 
@@ -64,7 +64,7 @@ def draw_angles(axes: Axes3D) -> None:
     outline(
         axes, np.array([[-0.5, -0.4, 0], [0.5, -0.4, 0], [0.5, 0.4, 0], [-0.5, 0.4, 0]]), "gray"
     )
-    axes.text(-0.5, 0.45, 0, "photo's top", color="gray", fontsize=8)
+    axes.text(-1.0, 0.2, 0, "photo, its\ntop to N", color="gray", fontsize=8)
     frame(axes)
 
 
@@ -90,7 +90,7 @@ def line(axes: Axes3D, points: NDArray[np.float64], colour: str, width: float) -
 
 
 def frame(axes: Axes3D) -> None:
-    axes.set_box_aspect((1, 1, 1))
+    axes.set_box_aspect((1, 1, 1), zoom=1.35)
     axes.set_xlim(-0.6, 1.7)
     axes.set_ylim(-0.6, 1.7)
     axes.set_zlim(-0.1, 2.0)

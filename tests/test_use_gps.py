@@ -22,7 +22,7 @@ from colmap_netvlad.mapping.incremental import map_incremental
 from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.mapping.parallel import map_parallel
 from colmap_netvlad.mapping.priors import PositionPriors, write_priors
-from colmap_netvlad.photos.xmp import read_deviations
+from colmap_netvlad.photos.accuracy import read_deviations
 
 RTK = 0.02
 CORRIDOR = SimulationOptions(lines=2, photos=30, features=150, partners=12, gps=RTK, focal_error=0)

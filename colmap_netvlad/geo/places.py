@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from colmap_netvlad.colmap.database import open_database
 from colmap_netvlad.geo.frames import Frame, frame_of
+from colmap_netvlad.photos.accuracy import read_deviations
 from colmap_netvlad.photos.positions import PosePrior, place, read_gps
-from colmap_netvlad.photos.xmp import read_deviations
 from colmap_netvlad.runtime import progress
 
 Array = NDArray[np.float64]
