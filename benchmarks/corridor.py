@@ -1,6 +1,6 @@
 """What position priors in the adjustment do for a corridor: three lines of 100 photos over 2.4 km.
 
-    python benchmarks/corridor.py [--noise 2 0.02] [--seeds 3]
+    python benchmarks/corridor.py [--noise 2 0.02] [--seeds 3] [--lines 3] [--photos 100]
 
 A simulated flight (features and matches with noise, no photos) with GPS of a stated noise is mapped
 incrementally and in parallel, without and with its positions in the adjustment, brought into the
@@ -28,6 +28,8 @@ from colmap_netvlad.mapping.parallel import map_parallel
 from colmap_netvlad.mapping.priors import PositionPriors
 
 CLUSTER = 60
+"""Photos of a cluster of the parallel mapper; half the flight where that is less."""
+
 HEAD = (
     "| GPS noise | mapper | positions | horizontal | vertical | largest | bend | focal | k1 | s |"
 )
@@ -74,7 +76,10 @@ def measure(
         places = find_places(image_names(database), database, None)
         deviations = np.full(places.metres.shape, noise)
         priors = PositionPriors(places.names, places.metres, deviations)
-        options = MappingOptions(cluster_size=CLUSTER, priors=priors if positions == "in" else None)
+        options = MappingOptions(
+            cluster_size=min(CLUSTER, lines * photos // 2),
+            priors=priors if positions == "in" else None,
+        )
         run = map_parallel if mapper == "parallel" else map_incremental
         start = time.monotonic()
         models = run(database, None, output, options)

@@ -12,6 +12,7 @@ import numpy as np
 import pycolmap
 
 from colmap_netvlad.cache.ranking import NO_PARTNER, Ranking
+from colmap_netvlad.colmap import engine
 from colmap_netvlad.colmap.database import image_names
 from colmap_netvlad.commands.georegister import (
     Placed,
@@ -209,7 +210,7 @@ def _join(
             join_and_adjust,
             (project.database, project.images, copies, folder, MappingOptions(seed=options.seed)),
         )
-        (outcome,) = workers.run([job], 1, bar.advance)
+        (outcome,) = workers.run([job], 1, bar.advance, initialiser=engine.initialiser())
     if outcome.fault is not None:
         raise InputError(f"The models could not be joined: {outcome.fault}.")
     note = folder / "merge.json"
