@@ -24,16 +24,20 @@ from colmap_netvlad.cli_options import (
     device_option,
     feature_options,
     given,
+    ground_options,
     json_option,
     k_option,
     mapping_options,
     masks_option,
     matching_options,
+    model_database_option,
     output_option,
+    place_options,
     project_options,
     refuse,
     retrieval_options,
     seed_option,
+    sparse_option,
     verbose_option,
     written_project_options,
 )
@@ -48,6 +52,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from colmap_netvlad.colmap.features import FeatureOptions
+    from colmap_netvlad.commands.georegister import ControlFile, WorldOptions
     from colmap_netvlad.commands.match import RoundsOptions
     from colmap_netvlad.commands.report import FlightReport
     from colmap_netvlad.mapping.options import MappingOptions
@@ -154,6 +159,13 @@ def features(images: Path, database: Path, features: FeatureOptions, masks: Path
     show_default=True,
     help="Pair each photo with this many that follow it by name too (video, flight lines).",
 )
+@click.option(
+    "--across",
+    type=click.IntRange(min=0),
+    default=0,
+    show_default=True,
+    help="Pair each photo with this many of other flights too: of another folder, day or camera.",
+)
 @click.option("--join", "own_pairs", type=FILE, help="A pairs list of your own to join in.")
 @click.option(
     "--connect/--no-connect",
@@ -177,6 +189,7 @@ def pairs(
     output: Path | None,
     other_cameras: float,
     sequential: int,
+    across: int,
     own_pairs: Path | None,
     connect: bool,
     export: Path | None,
@@ -200,7 +213,7 @@ def pairs(
         replace(retrieval, k=k),
         format,
         output,
-        PartnerRules(other_cameras, sequential, own_pairs),
+        PartnerRules(other_cameras, sequential, own_pairs, across),
         connect,
         export,
     )
@@ -252,6 +265,8 @@ def match(
     is_flag=True,
     help="Leave out pairs of look-alike places: what the pairs around them or GPS contradict.",
 )
+@place_options
+@ground_options
 @matching_options
 @json_option
 @verbose_option
@@ -261,6 +276,8 @@ def reconstruct(
     mapper: str,
     mapping: MappingOptions,
     drop_contradicted: bool,
+    world: WorldOptions,
+    gcp: ControlFile | None,
     pairs: Path | None,
     rounds: RoundsOptions | None,
     matching: MatchOptions,
@@ -277,9 +294,15 @@ def reconstruct(
     from colmap_netvlad.commands.reconstruct import reconstruct as run
     from colmap_netvlad.terminal import print_models
 
-    check_mapper(mapper)
-    mapping = replace(mapping, seed=matching.seed)
-    options = ReconstructOptions(mapper, mapping, matching, drop_contradicted, command_line())
+    check_mapper(mapper, use_gps=world.use_gps)
+    options = ReconstructOptions(
+        mapper,
+        replace(mapping, seed=matching.seed),
+        matching,
+        replace(world, gcp=gcp),
+        drop_contradicted,
+        command_line(),
+    )
     report = run(project, pairs, output, options, rounds)
     if as_json:
         print_json({**as_dictionary(report), "database": project.database})
@@ -346,19 +369,8 @@ def add(
 
 
 @cli.command()
-@click.option(
-    "--sparse",
-    type=PATH,
-    required=True,
-    help="Folder of a COLMAP model, made by whomever; of several models in it the largest.",
-)
-@click.option(
-    "--db",
-    "--database_path",
-    "database",
-    type=PATH,
-    help="COLMAP database it was made from.  [default: project.db or database.db beside the model]",
-)
+@sparse_option
+@model_database_option
 @click.option(
     "--images",
     "--image_path",
@@ -388,6 +400,129 @@ def say_verdict(reports: Sequence[FlightReport]) -> None:
 def command_line() -> str:
     """Return the command as the user gave it."""
     return shlex.join(["colmap-netvlad", *sys.argv[1:]])
+
+
+@cli.command()
+@sparse_option
+@model_database_option
+@click.option(
+    "--images",
+    "--image_path",
+    "images",
+    type=FOLDER,
+    help="Photo folder, for EXIF GPS.  [default: images/ beside the model's folder, where there"
+    " is one]",
+)
+@output_option(
+    help="Folder of the models in the world.  [default: the given one's name + -georegistered]"
+)
+@ground_options
+@seed_option
+@verbose_option
+def georegister(
+    sparse: Path,
+    database: Path | None,
+    images: Path | None,
+    output: Path | None,
+    gcp: ControlFile | None,
+    seed: int,
+) -> None:
+    """Bring any COLMAP model into the world: m east, north, up of a stated origin.
+
+    The model is aligned robustly to position priors of a database, to EXIF GPS or to ground
+    points, and written to a new folder, with georeference.json (origin, EPSG code of the UTM zone,
+    transform, residuals) in it. A database is not needed: the photos' GPS is enough.
+    """
+    from colmap_netvlad.commands.georegister import beside, report_lines
+    from colmap_netvlad.commands.georegister import georegister as run
+
+    database, images = beside(sparse, database, images)
+    report = run(sparse, output, database, images, gcp, seed)
+    say(*report_lines(report))
+    finish_partial(
+        [f"Left out: {one.name}: {one.fault}" for one in report.models if one.georeference is None]
+    )
+
+
+@cli.command()
+@sparse_option
+@model_database_option
+@click.option(
+    "--format",
+    "formats",
+    multiple=True,
+    type=click.Choice(["cameras", "footprints", "pairs", "shots", "csv", "las", "ply", "text"]),
+    help="What to write; may be given several times.  [default: all]",
+)
+@click.option(
+    "--crs",
+    help="Projected system of CSV, LAS and shots: EPSG:25832 for example."
+    "  [default: the UTM zone of the model]",
+)
+@output_option(help="A new folder.  [default: the model's name + -export]")
+def export(
+    sparse: Path,
+    database: Path | None,
+    formats: tuple[str, ...],
+    crs: str | None,
+    output: Path | None,
+) -> None:
+    """Write a georegistered model for other programs.
+
+    Cameras, footprints and pairs with weak links as GeoJSON, OpenDroneMap's shots.geojson,
+    cameras as CSV (easting, northing, height, omega, phi, kappa), points as LAS and PLY, and
+    COLMAP's text files.
+    """
+    from colmap_netvlad.commands.export import export as run
+    from colmap_netvlad.commands.export import report_lines
+    from colmap_netvlad.commands.georegister import beside
+
+    say(*report_lines(run(sparse, formats, output, beside(sparse, database, None)[0], crs)))
+
+
+@cli.command()
+@project_options
+@click.option(
+    "--sparse",
+    type=PATH,
+    multiple=True,
+    required=True,
+    help="A COLMAP model, or a folder of models 0, 1, ...; given twice or more.",
+)
+@output_option(help="Folder of the models.  [default: the next sparse-N beside the database]")
+@click.option(
+    "--across",
+    type=click.IntRange(min=1),
+    default=10,
+    show_default=True,
+    help="Partners in other models that each image is matched with.",
+)
+@click.option(
+    "--method",
+    default="hybrid",
+    show_default=True,
+    help="Retrieval method; `colmap-netvlad methods` lists them.",
+)
+@retrieval_options
+@verbose_option
+def merge(
+    project: Project,
+    sparse: tuple[Path, ...],
+    output: Path | None,
+    across: int,
+    method: str,
+    retrieval: RetrievalOptions,
+) -> None:
+    """Put models of one project together: several flights, days or heights.
+
+    Pairs across the models are retrieved, matched and verified (this writes the database); one
+    similarity is solved for all models at once, then all is adjusted together. Models that cannot
+    be joined stay and are named.
+    """
+    from colmap_netvlad.commands.merge import MergeOptions, merge_lines, merge_models
+
+    options = MergeOptions(method, retrieval, across)
+    say(*merge_lines(merge_models(project, sparse, output, options)))
 
 
 @cli.command()

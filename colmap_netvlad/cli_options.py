@@ -68,6 +68,17 @@ pairs_option = click.option(
     type=PATH,
     help="Pairs list (COLMAP's, .csv or .json).  [default: pairs.txt beside the database]",
 )
+sparse_option = click.option(
+    "--sparse", type=PATH, required=True, help="A COLMAP model, or a folder of models 0, 1, ..."
+)
+model_database_option = click.option(
+    "--db",
+    "--database_path",
+    "database",
+    type=FILE,
+    help="COLMAP database, for position priors and verified pairs.  [default: project.db or"
+    " database.db beside the model's folder, where there is one]",
+)
 copy_option = click.option(
     "--copy",
     is_flag=True,
@@ -256,8 +267,8 @@ FEATURES: tuple[Callable[[Any], Any], ...] = (
         "--camera",
         default="auto",
         show_default=True,
-        help="Which photos share a camera: auto (equal make, model, focal length and size; without"
-        " EXIF equal folder and size), single, per-folder, per-image.",
+        help="Which photos share a camera: auto (equal make, model, serial number, focal length and"
+        " size; without EXIF equal folder and size), single, per-folder, per-image.",
     ),
     click.option(
         "--camera-model",
@@ -288,6 +299,65 @@ def feature_options(**values: Any) -> dict[str, Any]:
 
     features: FeatureOptions = FeatureOptions(**values)
     return {"features": features}
+
+
+GROUND_POINTS: tuple[Callable[[Any], Any], ...] = (
+    click.option(
+        "--gcp",
+        type=FILE,
+        help="Ground points in OpenDroneMap's format (system, then x y z px py photo name): they"
+        " place the model and are held in a last adjustment.",
+    ),
+    click.option(
+        "--check",
+        multiple=True,
+        help="Name of a ground point that only checks the model; may be given several times.",
+    ),
+)
+
+
+@bundle(*GROUND_POINTS)
+def ground_options(gcp: Path | None, check: tuple[str, ...]) -> dict[str, Any]:
+    """--gcp --check, as `gcp`."""
+    from colmap_netvlad.commands.georegister import ControlFile
+
+    if gcp is None:
+        refuse(given("check"), "names points of --gcp; give the list.")
+        return {"gcp": None}
+    return {"gcp": ControlFile(gcp, check)}
+
+
+@bundle(
+    click.option(
+        "--georegister",
+        type=click.Choice(["auto", "off", "require"]),
+        default="auto",
+        show_default=True,
+        help="Whether the model is brought into the world, in m, by position priors or EXIF GPS.",
+    ),
+    click.option(
+        "--use-gps",
+        is_flag=True,
+        help="Adjust with the positions as priors, robustly: against drift and dome-shaped errors,"
+        " and for the focal length. Mappers incremental and parallel.",
+    ),
+    click.option(
+        "--gps-std",
+        type=(click.FloatRange(min=0, min_open=True),) * 2,
+        help="Standard deviations of the positions for --use-gps, m horizontal and vertical."
+        "  [default: what the database's priors, XMP (RTK) or EXIF state of each photo, else 3"
+        " and 5]",
+    ),
+)
+def place_options(
+    georegister: Any, use_gps: bool, gps_std: tuple[float, float] | None
+) -> dict[str, Any]:
+    """Where in the world the model is, as `world`."""
+    from colmap_netvlad.commands.georegister import WorldOptions
+
+    if not use_gps:
+        refuse(given("gps_std"), "says how good the positions of --use-gps are; add it.")
+    return {"world": WorldOptions(georegister, use_gps, gps_std)}
 
 
 @bundle(

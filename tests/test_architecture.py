@@ -28,6 +28,8 @@ FLOORS = [
     ["demo", "training"],
     ["report"],
     ["comparison"],
+    ["export"],
+    ["geo"],
     ["mapping"],
     ["matching"],
     ["pairs"],

@@ -129,3 +129,25 @@ def test_a_photo_without_readable_gps_has_none(tmp_path: Path, content: bytes | 
     else:
         photo.write_bytes(content)
     assert read_gps(photo) is None
+
+
+def test_a_flight_across_the_antimeridian_is_one_flight() -> None:
+    found = [wgs84(-17.0, longitude) for longitude in (179.9992, 179.9996, -180, -179.9996)]
+    positions = place([*found, wgs84(-17.0, 12.0)], NAMES)
+    steps = np.diff(positions.metres[:4, 0])
+    assert steps == pytest.approx([42.5] * 3, abs=0.1)
+    assert positions.known.tolist() == [True, True, True, True, False]
+
+
+def test_a_missing_height_is_not_taken_for_zero(tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif.get_ifd(0x8825).update({1: "N", 2: (47, 0, 0), 3: "E", 4: (8, 0, 0)})
+    Image.new("RGB", (32, 32)).save(tmp_path / "a.jpg", exif=exif)
+    prior = read_gps(tmp_path / "a.jpg")
+    assert prior is not None
+    assert prior.position[:2] == (47.0, 8.0)
+    assert np.isnan(prior.position[2])
+    positions = place([prior, wgs84(47.001, 8.0)], NAMES[:2])
+    assert positions.metres[0, 2] == pytest.approx(0.0, abs=0.01)  # for those that want a number
+    assert positions.geographic is not None
+    assert np.isnan(positions.geographic[0, 2])

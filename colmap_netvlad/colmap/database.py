@@ -230,6 +230,24 @@ class Database:
                 priors[image_id] = PosePrior((x, y, z), CoordinateSystem(system))
         return priors
 
+    def position_deviations(self) -> dict[int, tuple[float, float, float]]:
+        """Return the standard deviations of the position priors, m, by image id.
+
+        They are those of the covariance's diagonal (east, north, up for WGS84); priors without a
+        covariance, or of a COLMAP before 4.0, are absent.
+        """
+        if not {"corr_data_id", "position_covariance"} <= self._columns("pose_priors"):
+            return {}
+        deviations = {}
+        for image_id, blob in self.connection.execute(
+            "SELECT corr_data_id, position_covariance FROM pose_priors WHERE corr_sensor_type = 0"
+        ):
+            covariance = np.frombuffer(blob or b"", np.float64)
+            if covariance.size == 9 and (np.diag(covariance.reshape(3, 3)) > 0).all():
+                east, north, up = np.sqrt(np.diag(covariance.reshape(3, 3))).tolist()
+                deviations[image_id] = (east, north, up)
+        return deviations
+
     def frames(self) -> dict[int, int]:
         """Return the rig frame by image id (COLMAP 3.12 on); empty where there are no frames."""
         if not self._columns("frame_data"):

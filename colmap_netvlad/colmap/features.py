@@ -88,7 +88,7 @@ CameraKey = tuple[object, ...]
 
 def _same_lens(name: str, header: PhotoHeader) -> CameraKey:
     origin = header.lens or str(PurePosixPath(name).parent)
-    return origin, header.width, header.height
+    return origin, header.serial, header.width, header.height
 
 
 CAMERA_MODES: dict[str, Callable[[str, PhotoHeader], CameraKey]] = {
@@ -99,7 +99,8 @@ CAMERA_MODES: dict[str, Callable[[str, PhotoHeader], CameraKey]] = {
 }
 """Camera mode -> what photos of one camera have in common.
 
-`auto`: EXIF make, model and focal length, and size; without these tags folder and size. COLMAP's
+`auto`: EXIF make, model and focal length, serial number, and size: two drones of one model are two
+cameras; without these tags folder and size. COLMAP's
 own automatic mode gives every photo without EXIF a camera of its own, which makes hundreds of
 focal lengths of one drone's camera, each badly determined.
 """

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,13 @@ from colmap_netvlad.pairs.rules import (
     sequential_pairs,
     with_camera_quota,
     without_same_frame,
+)
+from colmap_netvlad.pairs.sessions import (
+    DEPTH,
+    across_pairs,
+    find_sessions,
+    joined,
+    session_lines,
 )
 from colmap_netvlad.pairs.union import ImagePair, union_of_top
 from colmap_netvlad.project import Project
@@ -43,6 +50,7 @@ class PairsReport:
         components: image names of each connected component of the pairs, largest first.
         connecting: pairs between components that were added because each image's own k partners
             do not connect all images.
+        sessions: what was taken for a flight of its own, in words; empty where nobody asked.
         output: the pairs list that holds every pair.
         colmap_list: the list for COLMAP, where it cannot hold all pairs and so differs from
             `output`; else None.
@@ -58,6 +66,7 @@ class PairsReport:
     unwritable: list[str]
     has_features: bool = False
     connecting: int = 0
+    sessions: list[str] = field(default_factory=list)
 
 
 def make_pairs(
@@ -105,7 +114,8 @@ def make_pairs(
     rules.check()
     with open_flight(project) as flight:
         extra = _extra_pairs(flight.names, rules)
-        ranking = rank(flight, method, options)
+        sessions = find_sessions(flight.names, project.images) if rules.across else []
+        ranking = rank(flight, method, options, DEPTH if rules.across else 0)
         if export is not None:
             export_descriptors(flight, method, options, export)
         frames = [flight.frames.get(image.image_id) for image in flight.images]
@@ -114,7 +124,9 @@ def make_pairs(
     ranking = without_same_frame(ranking, frames)
     depth = min(options.k, len(names) - 1)
     chosen = with_camera_quota(ranking, cameras, depth, rules.other_cameras)
-    pairs = join_pairs(union_of_top(chosen, depth), extra, names)
+    own = union_of_top(chosen, depth)
+    across = across_pairs(ranking, sessions, rules.across) if sessions else []
+    pairs = join_pairs(joined(own, across), extra, names)
     links = _links(ranking, pairs) if connect else []
     pairs = in_order([*pairs, *links], names)
     unwritable = write_pairs(output, pairs, format)
@@ -131,6 +143,7 @@ def make_pairs(
         unwritable,
         has_features,
         len(links),
+        session_lines(sessions) if sessions else [],
     )
 
 
@@ -185,6 +198,7 @@ def summary(project: Project, report: PairsReport) -> list[str]:
         f"Description  {ranking.seconds_describe:.1f} s",
         f"Search       {ranking.seconds_search:.1f} s",
         *(f"Note         {note}" for note in ranking.notes),
+        *(f"Across       {line}" for line in report.sessions),
         *_component_lines(report),
         f"Written      {report.output}",
     ]

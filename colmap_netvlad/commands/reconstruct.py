@@ -10,8 +10,16 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from colmap_netvlad.colmap.copies import copy_with_pairs
 from colmap_netvlad.colmap.database import image_names
+from colmap_netvlad.commands.georegister import (
+    Placed,
+    WorldOptions,
+    georegister_in_place,
+    places_for,
+)
 from colmap_netvlad.commands.match import (
     MatchingReport,
     PairsOrList,
@@ -22,12 +30,16 @@ from colmap_netvlad.commands.match import (
 from colmap_netvlad.commands.match import as_json as match_json
 from colmap_netvlad.commands.report import FlightReport, report_models, run_of
 from colmap_netvlad.flight import open_flight
+from colmap_netvlad.geo.align import MIN_PLACES
+from colmap_netvlad.geo.gcp import ControlList
+from colmap_netvlad.geo.places import Places, find_deviations, find_places
 from colmap_netvlad.graph.lookalikes import find_lookalikes
 from colmap_netvlad.graph.pair import Pair
 from colmap_netvlad.graph.verified import verified_by_name
-from colmap_netvlad.mapping import MAPPERS
+from colmap_netvlad.mapping import MAPPERS, WITH_PRIORS
 from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.mapping.output import free_output
+from colmap_netvlad.mapping.priors import PositionPriors
 from colmap_netvlad.mapping.summary import ModelSummary, combine, registered_names, summarize
 from colmap_netvlad.matching.rounds import rounds_lines
 from colmap_netvlad.matching.run import MatchOptions
@@ -46,11 +58,13 @@ class ReconstructOptions:
         matching: how pairs are matched.
         drop_contradicted: leave pairs that look like look-alikes out of the mapping.
         command: the command line that asked for it, for the quality report.
+        world: how models are brought into the world.
     """
 
     mapper: str = "auto"
     mapping: MappingOptions = MappingOptions()
     matching: MatchOptions = MatchOptions()
+    world: WorldOptions = WorldOptions()
     drop_contradicted: bool = False
     command: str = ""
 
@@ -69,6 +83,9 @@ class ReconstructReport:
         seconds: duration by stage, s.
         dropped: contradicted pairs that were left out of the mapping.
         quality: the quality report of each model, the largest first.
+        placed: where each model is in the world; empty where that was not asked or no position
+            is known.
+        notes: how good the positions are taken to be, and what was put aside among them.
     """
 
     output: Path
@@ -80,6 +97,8 @@ class ReconstructReport:
     seconds: dict[str, float] = field(default_factory=dict)
     dropped: list[Pair] = field(default_factory=list)
     quality: list[FlightReport] = field(default_factory=list)
+    placed: list[Placed] = field(default_factory=list)
+    notes: tuple[str, ...] = ()
 
 
 def reconstruct(
@@ -107,7 +126,8 @@ def reconstruct(
         InputError: no pairs, no features, an unknown mapper, no pair that could be verified, or
             no model at all.
     """
-    check_mapper(options.mapper)
+    check_mapper(options.mapper, use_gps=options.world.use_gps)
+    control, places = _known_places(project, options.world)
     matching = match(project, pairs, rounds, options.matching)
     matches = matching.matches
     if not matches.verified:
@@ -115,16 +135,25 @@ def reconstruct(
             f"None of the {matches.requested} pairs could be verified, so there is nothing to "
             "reconstruct; the photos may not overlap, or the pairs list be of other photos."
         )
+    mapping, notes = options.mapping, () if places is None else places.notes
+    if options.world.use_gps and places is not None:
+        mapping, note = _with_priors(project, places, options)
+        notes = (note, *notes)
     target = free_output(output or project.sparse)
     start = time.monotonic()
     mapper = MAPPERS[options.mapper]
     with mapping_database(project, options.drop_contradicted) as (database, dropped):
-        models = mapper(database, project.images, target, options.mapping)
+        models = mapper(database, project.images, target, mapping)
     seconds = {"matching": matches.seconds, "mapping": time.monotonic() - start}
     if not models:
         raise InputError(
             f"No model came out of {matches.verified} verified pairs: none has enough inliers and "
             "baseline to start from. More pairs (`k`) or more overlap may help."
+        )
+    placed = []
+    if places is not None:
+        placed = georegister_in_place(
+            target, places, control, adjusted=options.world.use_gps, seed=mapping.seed
         )
     run = run_of(options.command or "reconstruct, called from Python", seconds, asdict(options))
     run = replace(run, dropped=len(dropped))
@@ -141,6 +170,8 @@ def reconstruct(
         seconds=seconds,
         dropped=dropped,
         quality=quality,
+        placed=placed,
+        notes=notes,
     )
 
 
@@ -176,10 +207,56 @@ def contradicted_pairs(project: Project) -> list[Pair]:
     return [one.pair for one in found if one.contradicted]
 
 
-def check_mapper(name: str) -> None:
-    """Raise InputError unless `name` is a mapper."""
+def _known_places(
+    project: Project, world: WorldOptions
+) -> tuple[ControlList | None, Places | None]:
+    """Return ground points and known positions; None for both where models stay where they are.
+
+    Raises:
+        InputError: a place in the world is required, and too few positions are known; or the
+            ground points cannot be used.
+    """
+    names = image_names(project.database)
+    control = None if world.gcp is None else world.gcp.read(names)
+    if world.georegister == "off" and not world.use_gps and control is None:
+        return None, None
+    places = places_for(find_places(names, project.database, project.images), control)
+    if places.known >= MIN_PLACES:
+        return control, places
+    if world.use_gps or (world.georegister == "require" and control is None):
+        asked = "`use_gps`" if world.use_gps else "`georegister` require"
+        raise InputError(
+            f"{places.known} of {len(names)} photos have a usable position, and {asked} needs "
+            f"{MIN_PLACES}; nothing was mapped." + "".join(f" {note}" for note in places.notes)
+        )
+    return (None, None) if control is None else (control, places)
+
+
+def _with_priors(
+    project: Project, places: Places, options: ReconstructOptions
+) -> tuple[MappingOptions, str]:
+    """Return what the mapper is told with positions as priors, and a sentence on their accuracy."""
+    given = options.world.gps_std
+    deviations, stating = find_deviations(places.names, project.database, project.images, given)
+    priors = PositionPriors(places.names, places.metres, deviations)
+    source = f"{stating:,} photos state their own, the others have the default"
+    east, _, up = np.median(deviations, axis=0).tolist()
+    note = (
+        f"Adjusted with {places.known:,} positions; standard deviation {east:g} m horizontally, "
+        f"{up:g} m vertically in the median ({'as given' if given else source})."
+    )
+    return replace(options.mapping, priors=priors), note
+
+
+def check_mapper(name: str, *, use_gps: bool = False) -> None:
+    """Raise InputError unless `name` is a mapper, and one that takes positions if they are used."""
     if name not in MAPPERS:
         raise InputError(f"There is no mapper {name}; choose {', '.join(MAPPERS)}.")
+    if use_gps and name not in WITH_PRIORS:
+        raise InputError(
+            f"The mapper {name} cannot adjust with positions; `use_gps` works with "
+            f"{', '.join(WITH_PRIORS)}."
+        )
 
 
 def report_lines(report: ReconstructReport) -> list[str]:
@@ -199,6 +276,10 @@ def report_lines(report: ReconstructReport) -> list[str]:
         lines.append(
             f"Look-alikes: {len(report.dropped):,} contradicted pairs were left out of the mapping."
         )
+    for number, placed in enumerate(report.placed):
+        where = f"Model {number}: " if len(report.placed) > 1 else ""
+        lines += [where + line for line in placed.lines()]
+    lines += report.notes
     if report.missing:
         lines.append(
             f"Not registered: {len(report.missing)} of {report.images} images: "
@@ -219,5 +300,8 @@ def as_json(report: ReconstructReport) -> dict[str, Any]:
         "dropped": report.dropped,
         "seconds": report.seconds,
         "quality": [{"page": page.page, "verdict": page.verdict} for page in report.quality],
+        "georeferences": [
+            placed.georeference and placed.georeference.summary() for placed in report.placed
+        ],
         **match_json(report.matching),
     }

@@ -11,13 +11,22 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
+from pyproj import CRS
 from scipy.spatial import KDTree
+
+from colmap_netvlad.geo.frames import Frame
 
 WIDTH, HEIGHT, FOCAL, RADIAL = 1000, 750, 800.0, -0.02
 """The true camera: SIMPLE_RADIAL, px."""
 
 FLYING_HEIGHT = 100.0
 """Above the mean ground, m."""
+
+FRAME = Frame(53.3811, -1.4701)
+"""Where the simulated flight is: truth is m east, north, up of here."""
+
+REACH = 110.0
+"""No photo sees farther than this, m east or north; the distortion's polynomial is void there."""
 
 FORWARD, SIDE = 24.0, 45.0
 """Distance of photos in a line and of lines, m: overlaps of about 75 % and 65 %."""
@@ -37,6 +46,7 @@ class SimulationOptions:
         noise: standard deviation of a feature, px.
         partners: nearest photos that each photo is matched with.
         focal_error: relative error of the focal length that the database states.
+        gps: standard deviation of the position priors (WGS84), m; None: no priors.
         seed: seed of everything.
     """
 
@@ -49,6 +59,7 @@ class SimulationOptions:
     noise: float = 0.6
     partners: int = 20
     focal_error: float = 0.01
+    gps: float | None = None
     seed: int = 0
 
 
@@ -71,8 +82,51 @@ def simulate_flight(
     written = pycolmap.Database.open(database)
     with pycolmap.DatabaseTransaction(written):
         _write(rng, written, names, seen, rotations, centres, options)
+        if options.gps is not None:
+            _write_priors(written, names, centres, options.gps, options.seed)
     written.close()
     return dict(zip(names, centres, strict=True))
+
+
+def simulate_control(
+    path: Path,
+    options: SimulationOptions = SimulationOptions(),
+    rows: int = 3,
+    columns: int = 3,
+    noise: float = 0.5,
+) -> dict[str, NDArray[np.float64]]:
+    """Write a `gcp_list.txt` of ground points of a flight that `simulate_flight` simulates.
+
+    Args:
+        path: the list.
+        options: those of the flight.
+        rows, columns: of the grid of points; they are named GCP1, GCP2, ...
+        noise: standard deviation of a mark, px.
+
+    Returns:
+        the true place (x, y, z in m) of every point by name.
+    """
+    rotations, centres = _poses(np.random.default_rng(options.seed), options)
+    rng = np.random.default_rng([options.seed, 2])
+    low, high = centres[:, :2].min(axis=0) + 5, centres[:, :2].max(axis=0) - 5
+    east, north = np.linspace(low[0], high[0], columns), np.linspace(low[1], high[1], rows)
+    xy = np.stack(np.meshgrid(east, north), -1).reshape(-1, 2)
+    ground = np.column_stack([xy, _hills(xy)])
+    crs = CRS.from_epsg(FRAME.epsg)
+    surveyed = FRAME.to_crs(ground, crs)
+    lines = [f"EPSG:{FRAME.epsg}"]
+    for number, (place, known) in enumerate(zip(ground, surveyed, strict=True), 1):
+        for i, (rotation, centre) in enumerate(zip(rotations, centres, strict=True)):
+            (pixel,) = _project(rotation, centre, place[None])
+            near = np.abs(place - centre)[:2].max() < REACH
+            if near and (pixel > 0).all() and (pixel < [WIDTH, HEIGHT]).all():
+                x, y = pixel + rng.normal(0, noise, 2)
+                lines.append(
+                    " ".join(f"{value:.4f}" for value in (*known, x, y))
+                    + f" {i:05d}.jpg GCP{number}"
+                )
+    path.write_text("\n".join(lines) + "\n")
+    return {f"GCP{number}": place for number, place in enumerate(ground, 1)}
 
 
 def _poses(
@@ -108,9 +162,23 @@ def _ground(
     low, high = centres[:, :2].min(axis=0) - 80, centres[:, :2].max(axis=0) + 80
     count = int(np.prod(high - low) * options.features / footprint)
     xy = rng.uniform(low, high, (count, 2))
-    hills = 8 * np.sin(xy[:, 0] / 90) * np.cos(xy[:, 1] / 70)
     houses = rng.uniform(0, 10, count) * (rng.random(count) < 0.3)
-    return np.column_stack([xy, hills + houses])
+    return np.column_stack([xy, _hills(xy) + houses])
+
+
+def _hills(xy: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return (N,) heights of the ground, m."""
+    return 8 * np.sin(xy[:, 0] / 90) * np.cos(xy[:, 1] / 70)
+
+
+def _project(
+    rotation: NDArray[np.float64], centre: NDArray[np.float64], points: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return (N, 2) pixels of points below a camera."""
+    local = (points - centre) @ rotation.T
+    plane = local[:, :2] / local[:, 2:]
+    plane *= 1 + RADIAL * (plane**2).sum(axis=1, keepdims=True)
+    return plane * FOCAL + [WIDTH / 2, HEIGHT / 2]
 
 
 def _observe(
@@ -121,11 +189,8 @@ def _observe(
     options: SimulationOptions,
 ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
     """Return the ground points that a photo detects, ascending, and their keypoints."""
-    near = np.flatnonzero(np.abs(ground[:, :2] - centre[:2]).max(axis=1) < 110)
-    local = (ground[near] - centre) @ rotation.T
-    plane = local[:, :2] / local[:, 2:]
-    plane *= 1 + RADIAL * (plane**2).sum(axis=1, keepdims=True)
-    pixel = plane * FOCAL + [WIDTH / 2, HEIGHT / 2]
+    near = np.flatnonzero(np.abs(ground[:, :2] - centre[:2]).max(axis=1) < REACH)
+    pixel = _project(rotation, centre, ground[near])
     pixel += rng.normal(0, options.noise, pixel.shape)
     inside = ((pixel > 0) & (pixel < [WIDTH, HEIGHT])).all(axis=1)
     inside &= rng.random(len(near)) < options.detected
@@ -185,3 +250,21 @@ def _write(
         )
         database.write_matches(ids[i], ids[j], matches.astype(np.uint32))
         database.write_two_view_geometry(ids[i], ids[j], geometry)
+
+
+def _write_priors(
+    database: pycolmap.Database,
+    names: list[str],
+    centres: NDArray[np.float64],
+    deviation: float,
+    seed: int,
+) -> None:
+    """Write positions with noise as COLMAP does of EXIF GPS: WGS84, no covariance."""
+    noise = np.random.default_rng([seed, 1]).normal(0, deviation, centres.shape)
+    images = {image.name: image for image in database.read_all_images()}
+    for name, place in zip(names, FRAME.to_wgs84(centres + noise), strict=True):
+        prior = pycolmap.PosePrior()
+        prior.position = place
+        prior.coordinate_system = pycolmap.PosePriorCoordinateSystem.WGS84
+        prior.corr_data_id = images[name].data_id
+        database.write_pose_prior(prior)

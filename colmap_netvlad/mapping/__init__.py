@@ -30,3 +30,6 @@ MAPPERS: dict[str, Mapper] = {
     "auto": map_automatic,
 }
 """Name of `reconstruct --mapper` -> the mapper."""
+
+WITH_PRIORS = ("incremental", "parallel", "auto")
+"""Mappers that take position priors into the adjustment."""

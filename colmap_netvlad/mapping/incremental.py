@@ -10,6 +10,7 @@ from colmap_netvlad.colmap import engine
 from colmap_netvlad.colmap.database import open_database
 from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.mapping.output import model_folder
+from colmap_netvlad.mapping.priors import LOSS_SCALE, with_priors
 from colmap_netvlad.runtime import progress
 from colmap_netvlad.runtime.machine import usable_processors
 
@@ -38,12 +39,13 @@ def map_incremental(
         total = len(colmap.keypoint_counts())
     with (
         model_folder(output) as folder,
+        with_priors(database, options.priors, folder.parent) as source,
         progress.step("Registering images", total) as bar,
     ):
         models = engine.call(
             pycolmap.incremental_mapping,
             folder,
-            database,
+            source,
             images or folder,
             folder,
             options=pipeline_options(options, colors=images is not None),
@@ -64,5 +66,9 @@ def pipeline_options(
     pipeline.random_seed = options.seed
     pipeline.mapper.random_seed = options.seed
     pipeline.triangulation.random_seed = options.seed
+    if options.priors is not None:
+        pipeline.use_prior_position = True
+        pipeline.use_robust_loss_on_prior_position = True
+        pipeline.prior_position_loss_scale = LOSS_SCALE
     pipeline.num_threads = pipeline.mapper.num_threads = options.threads or usable_processors()
     return pipeline

@@ -204,7 +204,7 @@ def agreeing(
     base: SubModel, other: SubModel, pairs: NDArray[np.int64], base_from_other: pycolmap.Sim3d
 ) -> NDArray[np.bool_]:
     """Return which of the shared points lie within `MAX_PIXELS` of each other."""
-    moved = _move(base_from_other, other.xyz[pairs[:, 1]])
+    moved = move(base_from_other, other.xyz[pairs[:, 1]])
     distance = np.linalg.norm(moved - base.xyz[pairs[:, 0]], axis=1)
     return distance <= MAX_PIXELS * base.pixel
 
@@ -234,7 +234,7 @@ def join(base: SubModel, other: SubModel, seed: int = 0) -> SubModel:
     once.sort()
     keys, owner = keys[once], owner[once]
 
-    xyz = np.concatenate([base.xyz, _move(base_from_other, other.xyz)])
+    xyz = np.concatenate([base.xyz, move(base_from_other, other.xyz)])
     color = np.concatenate([base.color, other.color])
     seen = np.bincount(owner, minlength=len(xyz))
     kept = seen >= 2
@@ -245,7 +245,7 @@ def join(base: SubModel, other: SubModel, seed: int = 0) -> SubModel:
     return SubModel(
         base.name,
         poses=poses | base.poses,
-        cameras=_join_cameras(base.cameras, other.cameras),
+        cameras=join_cameras(base.cameras, other.cameras),
         rigs=other.rigs | base.rigs,
         xyz=xyz[kept],
         color=color[kept],
@@ -255,10 +255,11 @@ def join(base: SubModel, other: SubModel, seed: int = 0) -> SubModel:
     )
 
 
-def _join_cameras(
+def join_cameras(
     base: dict[int, tuple[NDArray[np.float64], int]],
     other: dict[int, tuple[NDArray[np.float64], int]],
 ) -> dict[int, tuple[NDArray[np.float64], int]]:
+    """Return the cameras of both; one of both gets the mean of its intrinsics, by images."""
     joined = dict(base)
     for camera_id, (params, count) in other.items():
         if camera_id in base:
@@ -269,7 +270,8 @@ def _join_cameras(
     return joined
 
 
-def _move(similarity: pycolmap.Sim3d, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
+def move(similarity: pycolmap.Sim3d, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return (N, 3) points moved by a similarity."""
     matrix = similarity.matrix()
     return xyz @ matrix[:, :3].T + matrix[:, 3]
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from colmap_netvlad.mapping.priors import PositionPriors
+
 
 @dataclass(frozen=True)
 class MappingOptions:
@@ -20,6 +22,8 @@ class MappingOptions:
             for overlap; None: a measured default.
         memory: bytes that the workers of `parallel` may take together; None: a share of the
             machine's.
+        priors: known positions, which are part of every bundle adjustment, robustly; the model
+            is then in their frame. Incremental and parallel mapping take them.
     """
 
     seed: int = 0
@@ -28,3 +32,4 @@ class MappingOptions:
     threads: int | None = None
     cluster_size: int | None = None
     memory: float | None = None
+    priors: PositionPriors | None = None

@@ -14,7 +14,7 @@ import math
 import shutil
 import tempfile
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import pycolmap
@@ -27,6 +27,7 @@ from colmap_netvlad.mapping.merge import merge, read_sub_model
 from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.mapping.output import model_folder
 from colmap_netvlad.mapping.partition import Cluster, partition
+from colmap_netvlad.mapping.priors import with_priors, write_priors
 from colmap_netvlad.mapping.refine import load_cache, rebuild, refine
 from colmap_netvlad.runtime import progress, workers
 from colmap_netvlad.runtime.errors import InputError
@@ -167,7 +168,11 @@ def open_state(
     """
     state = output.parent / f".{output.name}.clusters"
     digest = hashlib.sha256()
-    told = {key: value for key, value in asdict(options).items() if key in ("seed", "max_models")}
+    told = {
+        "seed": options.seed,
+        "max_models": options.max_models,
+        "priors": options.priors and options.priors.fingerprint(),
+    }
     digest.update(json.dumps([graph.names, told, pycolmap.__version__]).encode())
     digest.update(json.dumps([cluster.images for cluster in clusters]).encode())
     for array in (graph.edges, graph.inliers, graph.weights):
@@ -238,6 +243,8 @@ def map_cluster(
     """Map one cluster into `folder`/0, 1, ... (in a worker)."""
     subset = folder / "cluster.db"
     copy_images(database, subset, names)
+    if options.priors is not None:
+        write_priors(subset, options.priors)
     pipeline = pipeline_options(options, colors=False)
     pipeline.min_model_size = MIN_CLUSTER_MODEL
     pipeline.ba_global_frames_ratio = pipeline.ba_global_points_ratio = CLUSTER_GROWTH
@@ -316,7 +323,8 @@ def merge_models(
         for path in models
     ]
     merged = merge(sub_models, options.seed)
-    cache = load_cache(database)
+    with with_priors(database, options.priors, folder) as source:
+        cache = load_cache(source)
     pipeline = pipeline_options(options, colors=False)
     have: set[int] = set()
     told_percent = 0

@@ -75,6 +75,8 @@ def refine(
     cache: pycolmap.DatabaseCache,
     options: pycolmap.IncrementalPipelineOptions,
     reached: Callable[[float], None],
+    *,
+    triangulate: bool = False,
 ) -> None:
     """Adjust a merged model and register the images it misses, in place.
 
@@ -83,6 +85,8 @@ def refine(
 
     Args:
         reached: told the share of the work that is done, 0..1, as far as it is known.
+        triangulate: look for new points in every image: sub-models that share no image have none
+            yet where only images of several see a place.
     """
     mapper = pycolmap.IncrementalMapper(cache)
     mapper.begin_reconstruction(reconstruction)
@@ -90,6 +94,9 @@ def refine(
     robust.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     robust.ceres.solver_options.max_num_iterations = SEAM_ITERATIONS
     mapper.adjust_global_bundle(options.get_mapper(), robust)
+    if triangulate:
+        for image_id in reconstruction.reg_image_ids():
+            mapper.triangulate_image(options.get_triangulation(), image_id)
     reached(0.3)
     mapper.iterative_global_refinement(
         MAX_REFINEMENTS,
@@ -97,6 +104,7 @@ def refine(
         options.get_mapper(),
         bundle_options(options),
         options.get_triangulation(),
+        normalize_reconstruction=not options.use_prior_position,
     )
     mapper.filter_frames(options.get_mapper())
     reached(0.9)

@@ -27,16 +27,20 @@ class PartnerRules:
         other_cameras: least share of an image's partners that other cameras took, 0..1.
         sequential: neighbours in the order of the names that become pairs as well.
         own_pairs: a pairs list of the user's own, joined in.
+        across: partners in other flights that each image has besides (see `pairs.sessions`).
     """
 
     other_cameras: float = 0.0
     sequential: int = 0
     own_pairs: Path | None = None
+    across: int = 0
 
     def check(self) -> None:
         """Raise InputError where a value cannot be meant."""
         if not 0 <= self.other_cameras <= 1:
             raise InputError(f"`other_cameras` is {self.other_cameras}; it is a share, 0 to 1.")
+        if self.across < 0:
+            raise InputError(f"`across` is {self.across}; it must be at least 0.")
         if self.sequential < 0:
             raise InputError(f"`sequential` is {self.sequential}; it must be at least 0.")
 

@@ -17,12 +17,25 @@ from typing import BinaryIO
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 
+from colmap_netvlad.photos.xmp import properties
+
 PHOTO_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"})
 """What counts as a photo in a folder; other files (raw, video, logs) are passed over."""
 
 
 MIN_SIDE = 16
 """Photos with a shorter side than this hold nothing to describe, px."""
+
+DATE_TIME_ORIGINAL, BODY_SERIAL_NUMBER = 0x9003, 0xA431
+"""EXIF tags."""
+
+XMP_SERIAL_NUMBERS = (
+    "drone-dji:CameraSerialNumber",
+    "exifEX:BodySerialNumber",
+    "aux:SerialNumber",
+    "drone-dji:DroneSerialNumber",
+)
+"""Where XMP tells one camera from another of the same model, best first."""
 
 FINGERPRINT_BLOCKS = 8
 FINGERPRINT_BLOCK_BYTES = 16 * 1024
@@ -45,11 +58,16 @@ class PhotoHeader:
         width, height: pixels as stored, before any EXIF rotation (COLMAP's camera size).
         lens: EXIF make, model and focal length, which tell cameras apart; None where EXIF
             lacks one of them.
+        serial: number of the camera or, where that is not told, of the drone: EXIF's
+            BodySerialNumber, else XMP.
+        day: when the photo was taken, `YYYY:MM:DD` of EXIF.
     """
 
     width: int
     height: int
     lens: tuple[str, str, float] | None
+    serial: str | None = None
+    day: str | None = None
 
 
 def find_photos(folder: Path) -> list[str]:
@@ -132,7 +150,9 @@ def parse_header(data: bytes) -> PhotoHeader:
         raise BadPhoto("is empty")
     try:
         with open_header(io.BytesIO(data)) as photo:
-            header = PhotoHeader(photo.width, photo.height, _lens(photo))
+            header = PhotoHeader(
+                photo.width, photo.height, _lens(photo), _serial(photo), _day(photo)
+            )
     except UnidentifiedImageError as fault:
         raise BadPhoto("is not a photo") from fault
     except (OSError, SyntaxError, ValueError) as fault:
@@ -189,6 +209,26 @@ def _jpeg_is_whole(data: bytes) -> bool:
         else:
             at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
     return False
+
+
+def _serial(photo: Image.Image) -> str | None:
+    said = _detail(photo, BODY_SERIAL_NUMBER)
+    xmp = properties(photo)
+    return next((one for one in (said, *map(xmp.get, XMP_SERIAL_NUMBERS)) if one), None)
+
+
+def _day(photo: Image.Image) -> str | None:
+    taken = _detail(photo, DATE_TIME_ORIGINAL)
+    return taken[:10] if taken else None
+
+
+def _detail(photo: Image.Image, tag: int) -> str | None:
+    """Return a text of EXIF's own directory, or None where it is missing or broken."""
+    try:
+        value = photo.getexif().get_ifd(0x8769).get(tag)
+    except (KeyError, TypeError, ValueError, ArithmeticError, OSError, SyntaxError, struct.error):
+        return None
+    return str(value).strip("\0 ") if value is not None else None
 
 
 def _lens(photo: Image.Image) -> tuple[str, str, float] | None:

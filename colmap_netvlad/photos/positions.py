@@ -52,10 +52,13 @@ class Positions:
         metres: (N, 3) east, north, up (or the cartesian priors), in the order of the images;
             NaN where nothing is known or what is known cannot be right.
         notes: sentences on what was found and what was put aside, for the report.
+        geographic: (N, 3) WGS84 latitude, longitude (degrees) and height (m), NaN where unknown;
+            None where the priors are cartesian. The height alone may be unknown.
     """
 
     metres: NDArray[np.float64]
     notes: tuple[str, ...]
+    geographic: NDArray[np.float64] | None = None
 
     @property
     def known(self) -> NDArray[np.bool_]:
@@ -87,20 +90,25 @@ def place(found: Sequence[PosePrior | None], names: Sequence[str]) -> Positions:
         dtype=np.float64,
     ).reshape(-1, 3)
     notes: list[str] = []
+    geographic = None
     if system is CoordinateSystem.CARTESIAN:
         metres = raw
     else:
-        raw, notes = _mend_wgs84(raw, names)
-        metres = _local_metres(raw)
-    positions = Positions(metres, tuple(notes))
+        geographic, notes = _mend_wgs84(raw, names)
+        metres = _local_metres(geographic)
+    positions = Positions(metres, tuple(notes), geographic)
     if positions.known.any() and not positions.useful:
         notes.append("All known positions are equal, so they say nothing; they are not used.")
-        return Positions(np.full_like(metres, np.nan), tuple(notes))
+        nowhere = np.full_like(metres, np.nan)
+        return Positions(nowhere, tuple(notes), None if geographic is None else nowhere)
     return positions
 
 
 def read_gps(photo: Path) -> PosePrior | None:
-    """Return a photo's EXIF GPS as a WGS84 prior, or None where it has none that is readable."""
+    """Return a photo's EXIF GPS as a WGS84 prior, or None where it has none that is readable.
+
+    The height is NaN where the photo has latitude and longitude alone.
+    """
     try:
         with open_header(photo) as image:
             gps = image.getexif().get_ifd(GPS_IFD)
@@ -124,7 +132,7 @@ def _altitude(gps: Mapping[int, object]) -> float:
     try:
         altitude = float(gps[6])  # type: ignore[arg-type]
     except (KeyError, TypeError, ValueError, ZeroDivisionError):
-        return 0.0
+        return float("nan")
     below_sea = gps.get(5) in (1, b"\x01")
     return -altitude if below_sea else altitude
 
@@ -150,7 +158,7 @@ def _mend_wgs84(
     notes: list[str] = []
     zero = (raw[:, 0] == 0) & (raw[:, 1] == 0)
     _put_aside(raw, zero, names, "have GPS at latitude and longitude zero", notes)
-    middle = _middle(raw)
+    middle = middle_of(raw)
     if middle is None:
         return raw, notes
     away = _metres_between(raw, middle) > FAR_AWAY
@@ -172,7 +180,7 @@ def _put_aside(
 ) -> None:
     if wrong.any():
         raw[wrong] = np.nan
-        notes.append(_sentence(wrong, names, f"{what}; ranked by appearance alone"))
+        notes.append(_sentence(wrong, names, f"{what}; not used"))
 
 
 def _sentence(which: NDArray[np.bool_], names: Sequence[str], what: str) -> str:
@@ -181,12 +189,31 @@ def _sentence(which: NDArray[np.bool_], names: Sequence[str], what: str) -> str:
     return f"{count} photo{'s' if count > 1 else ''} (first: {first}) {what}."
 
 
-def _middle(raw: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    globe = (np.abs(raw[:, 0]) <= 90) & (np.abs(raw[:, 1]) <= 180)
-    if not globe.any():
+def middle_of(geographic: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """Return the median latitude and longitude of those on the globe, or None without any.
+
+    Longitudes are taken around their mean direction, since they jump by 360 at the antimeridian.
+
+    Args:
+        geographic: (N, 2 or 3) latitude, longitude in degrees; NaN where unknown.
+    """
+    latitude, longitude = geographic[~_off_globe(geographic), :2].T
+    if not len(latitude):
         return None
-    middle: NDArray[np.float64] = np.median(raw[globe, :2], axis=0)
-    return middle
+    angle = np.radians(longitude)
+    mean = float(np.degrees(np.arctan2(np.sin(angle).sum(), np.cos(angle).sum())))
+    east = float(np.median(_around(longitude, mean)))
+    return np.array([np.median(latitude), (east + 180) % 360 - 180])
+
+
+def _off_globe(raw: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Whether latitude or longitude cannot be, or are not known."""
+    return ~((np.abs(raw[:, 0]) <= 90) & (np.abs(raw[:, 1]) <= 180))
+
+
+def _around(longitude: NDArray[np.float64], middle: float) -> NDArray[np.float64]:
+    """Return longitudes within 180 degrees of the middle, by whole turns."""
+    return longitude + 360 * np.round((middle - longitude) / 360)
 
 
 def _metres_between(raw: NDArray[np.float64], middle: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -195,17 +222,20 @@ def _metres_between(raw: NDArray[np.float64], middle: NDArray[np.float64]) -> ND
     ground = np.vstack([raw[:, :2], middle])
     on_earth = _earth().ellipsoid_to_ecef(np.column_stack([ground, np.zeros(len(ground))]))
     distance = np.linalg.norm(on_earth[:-1] - on_earth[-1], axis=1)
-    off_globe = (np.abs(raw[:, 0]) > 90) | (np.abs(raw[:, 1]) > 180)
-    result: NDArray[np.float64] = np.where(off_globe, np.inf, distance)
+    result: NDArray[np.float64] = np.where(_off_globe(raw) & ~np.isnan(distance), np.inf, distance)
     return result
 
 
 def _local_metres(raw: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return east, north, up in m on the plane that touches the ellipsoid in the middle."""
-    middle = _middle(raw)
+    """Return (N, 3) east, north, up in m on the plane that touches the ellipsoid in the middle.
+
+    An unknown height counts as 0.
+    """
+    middle = middle_of(raw)
     if middle is None:
         return np.full_like(raw, np.nan)
-    metres: NDArray[np.float64] = _earth().ellipsoid_to_enu(raw, middle[0], middle[1], 0.0)
+    filled = np.column_stack([raw[:, :2], np.nan_to_num(raw[:, 2])])
+    metres: NDArray[np.float64] = _earth().ellipsoid_to_enu(filled, middle[0], middle[1], 0.0)
     return metres
 
 

@@ -1,0 +1,329 @@
+"""Models into the world: what `georegister` does, and `reconstruct` after mapping."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import pycolmap
+
+from colmap_netvlad.geo.align import ERROR_LADDER, Alignment, NotAligned, align, as_it_lies
+from colmap_netvlad.geo.frames import frame_of
+from colmap_netvlad.geo.gcp import (
+    ControlList,
+    adjust_to_control,
+    align_to_control,
+    measure_control,
+    read_control,
+)
+from colmap_netvlad.geo.georeference import Georeference, transformed
+from colmap_netvlad.geo.places import Places, find_places
+from colmap_netvlad.mapping.output import free_output, model_folder
+from colmap_netvlad.project import DATABASE_NAMES
+from colmap_netvlad.runtime.errors import InputError
+
+
+@dataclass(frozen=True)
+class ControlFile:
+    """A list of ground points to be read.
+
+    Attributes:
+        path: the list, in OpenDroneMap's format.
+        check: names of check points.
+    """
+
+    path: Path
+    check: tuple[str, ...] = ()
+
+    def read(self, photos: Sequence[str]) -> ControlList:
+        """Read it for a project's photos (see `geo.gcp.read_control`)."""
+        return read_control(self.path, photos, self.check)
+
+
+@dataclass(frozen=True)
+class WorldOptions:
+    """How models that have just been mapped are brought into the world.
+
+    Attributes:
+        georegister: auto (where positions are known), off, require.
+        use_gps: adjust with the positions as priors.
+        gps_std: standard deviation of positions, m horizontal and vertical, for all photos; None:
+            what each photo states, else `geo.places.DEFAULT_DEVIATIONS`.
+        gcp: ground points, which place the models and are held in a last adjustment.
+    """
+
+    georegister: Literal["auto", "off", "require"] = "auto"
+    use_gps: bool = False
+    gps_std: tuple[float, float] | None = None
+    gcp: ControlFile | None = None
+
+
+MODEL_FILES = ("images.bin", "images.txt")
+"""Either says that a folder is a COLMAP model."""
+
+
+@dataclass(frozen=True)
+class Placed:
+    """What became of one model.
+
+    Attributes:
+        name: of its folder.
+        georeference: where it is now; None where it could not be placed.
+        fault: why not, a sentence.
+    """
+
+    name: str
+    georeference: Georeference | None
+    fault: str = ""
+
+    def lines(self) -> list[str]:
+        """Return the sentences for a user."""
+        if self.georeference is None:
+            return [f"Not georegistered: {self.fault}"]
+        return self.georeference.lines()
+
+
+@dataclass(frozen=True)
+class GeoregisterReport:
+    """What `georegister` did.
+
+    Attributes:
+        output: folder of the models.
+        models: what became of each.
+        notes: what was put aside among the positions.
+    """
+
+    output: Path
+    models: list[Placed]
+    notes: tuple[str, ...]
+
+
+def georegister(
+    sparse: Path,
+    output: Path | None = None,
+    database: Path | None = None,
+    images: Path | None = None,
+    gcp: ControlFile | None = None,
+    seed: int = 0,
+) -> GeoregisterReport:
+    """Bring models into the world and write them, with `georeference.json`, to a new folder.
+
+    Args:
+        sparse: a COLMAP model, or a folder of models 0, 1, ...; left as it is.
+        output: where they go, laid out as they were; default: `<sparse>-georegistered`.
+        database: for position priors; None: EXIF alone.
+        images: photo folder, for EXIF GPS.
+        gcp: ground points, which place the model instead of its positions.
+        seed: of RANSAC.
+
+    Raises:
+        InputError: no model, no positions, or not one model could be placed.
+    """
+    folders = find_models(sparse)
+    models = [read_model(folder) for folder in folders]
+    names = sorted({name for model in models for name in _poses(model)[0]})
+    control = None if gcp is None else gcp.read(names)
+    places = places_for(find_places(names, database, images), control)
+    if not places.known and control is None:
+        asked = " and ".join(str(path) for path in (database, images) if path is not None)
+        raise InputError(
+            f"No position is known of any of the {len(names)} photos "
+            + (
+                f"(looked in {asked})"
+                if asked
+                else "(name the photos' folder as `images`, or a `database`)"
+            )
+            + ", so the model cannot be georegistered."
+            + "".join(f" {note}" for note in places.notes)
+        )
+    output = output or free_output(sparse.with_name(f"{sparse.resolve().name}-georegistered"))
+    placed = []
+    with model_folder(output) as temporary:
+        for folder, model in zip(folders, models, strict=True):
+            target = temporary if folder == sparse else temporary / folder.name
+            target.mkdir(exist_ok=True)
+            placed.append(place_model(folder.name, model, places, target, control, seed=seed))
+        if not any(one.georeference for one in placed):
+            raise InputError(f"No model of {sparse} could be georegistered: {placed[0].fault}")
+        for one in placed:
+            if one.georeference is None:
+                (temporary / one.name).rmdir()
+    return GeoregisterReport(output, placed, places.notes)
+
+
+def report_lines(report: GeoregisterReport) -> list[str]:
+    """Return what `colmap-netvlad georegister` prints."""
+    lines = [f"{placed.name}: {line}" for placed in report.models for line in placed.lines()]
+    return [*lines, *report.notes, f"Written to {report.output}."]
+
+
+def georegister_in_place(
+    folder: Path,
+    places: Places,
+    control: ControlList | None = None,
+    *,
+    adjusted: bool = False,
+    seed: int = 0,
+) -> list[Placed]:
+    """Bring the models that a mapper has just written into the world, where they are.
+
+    Args:
+        folder: of models 0, 1, ...
+        places: known positions.
+        control: ground points, which place the models instead.
+        adjusted: the mapper had these positions as priors, so the models are in their frame.
+        seed: of RANSAC.
+    """
+    placed = []
+    for path in find_models(folder):
+        draft = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=folder))
+        try:
+            one = place_model(
+                path.name, read_model(path), places, draft, control, adjusted=adjusted, seed=seed
+            )
+            if one.georeference is not None:
+                for file in sorted(draft.iterdir()):
+                    file.replace(path / file.name)
+        finally:
+            shutil.rmtree(draft, ignore_errors=True)
+        placed.append(one)
+    return placed
+
+
+def place_model(
+    name: str,
+    model: pycolmap.Reconstruction,
+    places: Places,
+    target: Path,
+    control: ControlList | None = None,
+    *,
+    adjusted: bool = False,
+    seed: int = 0,
+) -> Placed:
+    """Align one model and write it to `target`; a model that cannot be placed is not written."""
+    names, centres, rotations = _poses(model)
+    known = places.of(names)
+    if control is not None and places.frame is not None:
+        return _place_by_control(name, model, places, target, control)
+    try:
+        alignment = align(names, centres, rotations, known, seed)
+    except NotAligned as fault:
+        return Placed(name, None, fault.message)
+    if adjusted:
+        lying = as_it_lies(names, centres, known)
+        # Adjusted with the positions it needs no moving, unless they leave its turn open.
+        if _lies_well(lying) and not alignment.notes:
+            alignment = lying
+    transformed(model, alignment).write(target)
+    georeference = Georeference(places.frame, alignment, adjusted)
+    georeference.write(target)
+    return Placed(name, georeference)
+
+
+def beside(
+    sparse: Path, database: Path | None, images: Path | None
+) -> tuple[Path | None, Path | None]:
+    """Return database and photo folder as given, else those in the folder that holds the models."""
+    for folder in sparse.resolve().parents[:2]:
+        if database is None:
+            database = next(
+                (folder / name for name in DATABASE_NAMES if (folder / name).is_file()), None
+            )
+        if images is None and (folder / "images").is_dir():
+            images = folder / "images"
+    return database, images
+
+
+def _place_by_control(
+    name: str,
+    model: pycolmap.Reconstruction,
+    places: Places,
+    target: Path,
+    control: ControlList,
+) -> Placed:
+    """Align one model to its control points, adjust it with them, and write it to `target`."""
+    frame = places.frame
+    assert frame is not None
+    try:
+        similarity = align_to_control(model, control, frame)
+    except NotAligned as fault:
+        return Placed(name, None, " ".join([fault.message, *control.notes]))
+    model = pycolmap.Reconstruction(model)
+    model.transform(similarity)
+    adjust_to_control(model, control, frame)
+    names, centres, _ = _poses(model)
+    alignment = replace(as_it_lies(names, centres, places.of(names)), world_from_model=similarity)
+    model.write(target)
+    georeference = Georeference(frame, alignment, control=measure_control(model, control, frame))
+    georeference.write(target)
+    return Placed(name, georeference)
+
+
+def places_for(places: Places, control: ControlList | None) -> Places:
+    """Return places in a frame on the globe where ground points need one.
+
+    Raises:
+        InputError: the positions are cartesian, so that ground points have no place among them.
+    """
+    if control is None or places.frame is not None:
+        return places
+    if places.known:
+        raise InputError(
+            "The database's position priors are cartesian, and ground points are on the globe; "
+            "the two do not go together."
+        )
+    return replace(places, frame=frame_of(control.geographic()))
+
+
+def find_models(sparse: Path) -> list[Path]:
+    """Return the folders of the models in a folder: itself, or 0, 1, ... in it.
+
+    Raises:
+        InputError: there is none.
+    """
+    if _is_model(sparse):
+        return [sparse]
+    if sparse.is_dir():
+        found = [path for path in sparse.iterdir() if path.name.isdigit() and _is_model(path)]
+        if found:
+            return sorted(found, key=lambda path: int(path.name))
+    raise InputError(
+        f"{sparse} holds no COLMAP model (cameras, images, points3D); name one as `sparse`."
+    )
+
+
+def read_model(folder: Path) -> pycolmap.Reconstruction:
+    """Read a COLMAP model.
+
+    Raises:
+        InputError: it is damaged.
+    """
+    try:
+        return pycolmap.Reconstruction(folder)
+    except (ValueError, RuntimeError, OSError) as fault:
+        raise InputError(f"The model in {folder} is damaged and cannot be read.") from fault
+
+
+def _is_model(folder: Path) -> bool:
+    return any((folder / name).is_file() for name in MODEL_FILES)
+
+
+def _lies_well(alignment: Alignment) -> bool:
+    sizes = np.linalg.norm(np.nan_to_num(alignment.residuals), axis=1)
+    return len(sizes) > 0 and float(np.median(sizes)) <= ERROR_LADDER[-1]
+
+
+def _poses(model: pycolmap.Reconstruction) -> tuple[Sequence[str], np.ndarray, np.ndarray]:
+    """Return names, (N, 3) centres and (N, 3, 3) cam_from_world of the registered images."""
+    images = sorted(
+        (model.image(image_id) for image_id in model.reg_image_ids()), key=lambda image: image.name
+    )
+    poses = [image.cam_from_world().matrix() for image in images]
+    rotations = np.array([pose[:, :3] for pose in poses]).reshape(-1, 3, 3)
+    centres = np.array([-pose[:, :3].T @ pose[:, 3] for pose in poses]).reshape(-1, 3)
+    return [image.name for image in images], centres, rotations

@@ -1,0 +1,1 @@
+"""A model in the world: frames, alignment, ground control, position priors."""

@@ -1,0 +1,127 @@
+"""Coordinate frames: WGS84, a local east-north-up frame at a stated origin, UTM.
+
+Models are kept in the local frame: true metres, z up, small numbers. Its axes are those of the
+tangent plane at the origin, so that a place 1 km away lies 8 cm below the height it has over the
+ellipsoid; every conversion here is exact, and takes account of it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from pyproj import CRS, Transformer
+from pyproj.enums import TransformDirection
+from pyproj.exceptions import CRSError
+
+from colmap_netvlad.photos.positions import middle_of
+from colmap_netvlad.runtime.errors import InputError
+
+ORIGIN_DECIMALS = 6
+"""The origin is stated to this many decimals of a degree, about 0.1 m, and is exact as stated."""
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Frame:
+    """East, north, up in m at an origin.
+
+    Attributes:
+        latitude, longitude: of the origin, WGS84 degrees.
+        height: of the origin, m, in the height system of the photos.
+    """
+
+    latitude: float
+    longitude: float
+    height: float = 0.0
+
+    @property
+    def epsg(self) -> int:
+        """EPSG code of the UTM zone of the origin (of UPS beyond 84° N and 80° S).
+
+        The whole flight keeps the origin's zone, also where it crosses a zone's border.
+        """
+        if self.latitude >= 84:
+            return 32661
+        if self.latitude < -80:
+            return 32761
+        zone = int((self.longitude + 180) // 6) % 60 + 1
+        return (32600 if self.latitude >= 0 else 32700) + zone
+
+    def from_wgs84(self, geographic: Array) -> Array:
+        """Return (N, 3) m east, north, up of (N, 3) latitude, longitude (degrees), height (m)."""
+        latitude, longitude, height = np.asarray(geographic, np.float64).reshape(-1, 3).T
+        return np.column_stack(self._topocentric.transform(longitude, latitude, height))
+
+    def to_wgs84(self, metres: Array) -> Array:
+        """Return (N, 3) latitude, longitude (degrees), height (m) of (N, 3) m east, north, up."""
+        east, north, up = np.asarray(metres, np.float64).reshape(-1, 3).T
+        longitude, latitude, height = self._topocentric.transform(
+            east, north, up, direction=TransformDirection.INVERSE
+        )
+        return np.column_stack([latitude, longitude, height])
+
+    def to_crs(self, metres: Array, crs: CRS) -> Array:
+        """Return (N, 3) easting, northing, height in a projected system of (N, 3) m of the frame.
+
+        Heights are those of the photos; only the horizontal place is projected.
+        """
+        latitude, longitude, height = self.to_wgs84(metres).T
+        to_crs = Transformer.from_crs("EPSG:4326", crs, always_xy=True)
+        easting, northing = to_crs.transform(longitude, latitude)
+        return np.column_stack([easting, northing, height])
+
+    def from_crs(self, places: Array, crs: CRS) -> Array:
+        """Return (N, 3) m of the frame of (N, 3) x, y, height in any horizontal system.
+
+        x is east or longitude, y north or latitude, whatever order the system's own axes have.
+        """
+        x, y, height = np.asarray(places, np.float64).reshape(-1, 3).T
+        to_wgs84 = Transformer.from_crs(crs, "EPSG:4326", always_xy=True)
+        longitude, latitude = to_wgs84.transform(x, y)
+        return self.from_wgs84(np.column_stack([latitude, longitude, height]))
+
+    @cached_property
+    def _topocentric(self) -> Transformer:
+        return Transformer.from_pipeline(
+            "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad "
+            "+step +proj=cart +ellps=WGS84 +step +proj=topocentric +ellps=WGS84 "
+            f"+lon_0={self.longitude!r} +lat_0={self.latitude!r} +h_0={self.height!r}"
+        )
+
+
+def frame_of(geographic: Array) -> Frame:
+    """Return the frame in the middle of a flight, its origin at height 0.
+
+    Args:
+        geographic: (N, 3) latitude, longitude (degrees), height; NaN where unknown, not for all.
+    """
+    middle = middle_of(geographic)
+    assert middle is not None
+    latitude, longitude = middle.tolist()
+    return Frame(round(latitude, ORIGIN_DECIMALS), round(longitude, ORIGIN_DECIMALS))
+
+
+def read_crs(text: str) -> CRS:
+    """Return a coordinate system by EPSG code, PROJ string or WKT.
+
+    Raises:
+        InputError: none is known by that name.
+    """
+    name = text.strip()
+    if name.upper().startswith("WGS84 UTM"):  # OpenDroneMap's way: WGS84 UTM 32N
+        zone = name[9:].strip().upper()
+        south = zone.endswith("S")
+        digits = zone.rstrip("NS ")
+        if digits.isdigit() and 1 <= int(digits) <= 60:
+            return CRS.from_epsg((32700 if south else 32600) + int(digits))
+    try:
+        return CRS.from_user_input(int(name) if name.isdigit() else name)
+    except CRSError as fault:
+        raise InputError(
+            f"The coordinate system {name!r} is not known; name one as EPSG:32632, as a PROJ "
+            "string or as WGS84 UTM 32N."
+        ) from fault

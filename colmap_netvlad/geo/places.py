@@ -1,0 +1,144 @@
+"""Where photos were taken, in one frame: priors of the database, else EXIF GPS."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_netvlad.colmap.database import open_database
+from colmap_netvlad.geo.frames import Frame, frame_of
+from colmap_netvlad.photos.accuracy import read_deviations
+from colmap_netvlad.photos.positions import PosePrior, place, read_gps
+from colmap_netvlad.runtime import progress
+
+Array = NDArray[np.float64]
+
+DEFAULT_DEVIATIONS = (3.0, 3.0, 5.0)
+"""Standard deviations of a position for which none is stated, m east, north, up: a drone's GPS
+without corrections."""
+
+HEIGHTS = "as the photos state them; no geoid model is applied"
+"""What is said of heights: EXIF means them above sea level, RTK writes them above the ellipsoid,
+and a photo does not tell which."""
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """Known positions in m.
+
+    Attributes:
+        names: of N photos.
+        metres: (N, 3) east, north, up in `frame`; NaN where nothing is known, NaN up where the
+            height alone is not.
+        frame: None where the priors are cartesian: the world is then their own system.
+        notes: sentences on what was put aside.
+    """
+
+    names: tuple[str, ...]
+    metres: Array
+    frame: Frame | None
+    notes: tuple[str, ...]
+
+    @property
+    def known(self) -> int:
+        """How many photos have a position."""
+        return int(np.isfinite(self.metres[:, :2]).all(axis=1).sum())
+
+    def of(self, names: Sequence[str]) -> Array:
+        """Return (M, 3) m of photos by name; NaN for one that is not known."""
+        row = {name: i for i, name in enumerate(self.names)}
+        found = np.full((len(names), 3), np.nan)
+        for i, name in enumerate(names):
+            if name in row:
+                found[i] = self.metres[row[name]]
+        return found
+
+
+def find_places(names: Sequence[str], database: Path | None, images: Path | None) -> Places:
+    """Look up the positions of photos: the database's priors first, then EXIF GPS.
+
+    What cannot be right is put aside and said (see `photos.positions.place`).
+
+    Args:
+        names: of the photos, relative to `images`.
+        database: COLMAP database, or None where there is none.
+        images: photo folder, or None where it is not known.
+    """
+    priors: dict[str, PosePrior] = {}
+    if database is not None:
+        with open_database(database) as opened:
+            by_id = opened.pose_priors()
+            priors = {
+                row.name: by_id[row.image_id] for row in opened.images() if row.image_id in by_id
+            }
+    found = [priors.get(name) for name in names]
+    missing = [i for i, prior in enumerate(found) if prior is None]
+    if missing and images is not None and images.is_dir():
+        with progress.step("Reading GPS of photos", len(missing)) as bar:
+            for i in missing:
+                found[i] = read_gps(images / names[i])
+                bar.advance()
+    positions = place(found, names)
+    if positions.geographic is None:
+        return Places(tuple(names), positions.metres, None, positions.notes)
+    if not positions.known.any():
+        nowhere = np.full((len(names), 3), np.nan)
+        return Places(tuple(names), nowhere, None, positions.notes)
+    return in_frame(names, positions.geographic, frame_of(positions.geographic), positions.notes)
+
+
+def in_frame(
+    names: Sequence[str], geographic: Array, frame: Frame, notes: tuple[str, ...] = ()
+) -> Places:
+    """Return places of (N, 3) latitude, longitude, height in a frame.
+
+    An unknown height stays unknown; the place is then projected as if it had the others' height.
+    """
+    metres = np.full((len(names), 3), np.nan)
+    known = np.isfinite(geographic[:, :2]).all(axis=1)
+    filled = geographic[known].copy()
+    low = ~np.isfinite(filled[:, 2])
+    filled[low, 2] = np.median(filled[~low, 2]) if (~low).any() else frame.height
+    metres[known] = frame.from_wgs84(filled)
+    metres[np.flatnonzero(known)[low], 2] = np.nan
+    return Places(tuple(names), metres, frame, notes)
+
+
+def find_deviations(
+    names: Sequence[str],
+    database: Path | None,
+    images: Path | None,
+    stated: tuple[float, float] | None = None,
+) -> tuple[Array, int]:
+    """Return (N, 3) standard deviations of positions, m, and how many photos state their own.
+
+    Args:
+        names: of the photos.
+        database: COLMAP database, whose priors' covariances come first.
+        images: photo folder, for what XMP and EXIF state.
+        stated: horizontal and vertical standard deviation that the user gives for all.
+    """
+    deviations = np.tile(DEFAULT_DEVIATIONS, (len(names), 1))
+    if stated is not None:
+        return np.tile([stated[0], stated[0], stated[1]], (len(names), 1)), 0
+    own = _prior_deviations(database) if database is not None else {}
+    if images is not None and images.is_dir():
+        with progress.step("Reading accuracy of GPS", len(names)) as bar:
+            for name in names:
+                if name not in own:
+                    stating = read_deviations(images / name)
+                    own |= {} if stating is None else {name: stating}
+                bar.advance()
+    for i, name in enumerate(names):
+        deviations[i] = own.get(name, DEFAULT_DEVIATIONS)
+    return deviations, sum(name in own for name in names)
+
+
+def _prior_deviations(database: Path) -> dict[str, tuple[float, float, float]]:
+    with open_database(database) as opened:
+        by_id = opened.position_deviations()
+        return {row.name: by_id[row.image_id] for row in opened.images() if row.image_id in by_id}
