@@ -19,7 +19,7 @@ from photos import save_jpeg, scene
 from colmap_netvlad.cli import cli
 from colmap_netvlad.colmap import engine
 from colmap_netvlad.colmap.database import image_names, open_database
-from colmap_netvlad.matching import run as matching
+from colmap_netvlad.matching import colmap as matching
 from colmap_netvlad.project import Project
 from colmap_netvlad.runtime.errors import InputError
 from colmap_netvlad.runtime.files import write_atomically
