@@ -174,6 +174,7 @@ class _Run:
     ids: dict[str, int]
     plan: _Plan
     matcher: str = MATCHER_DEFAULT
+    even_seconds: float = 0.0
 
     def spend(self) -> RoundsReport:
         similarity = similarity_matrix(self.ranking)
@@ -226,6 +227,7 @@ class _Run:
         if pairs:
             report = match_pairs(self.project.database, pairs, self.matching)
             seconds, given_up, self.matcher = report.seconds, report.given_up, report.matcher
+            self.even_seconds += report.even_seconds
         verified = self._verified()
         correct = sum(verified.get(pair, 0) > CORRECT_MATCHES for pair in chosen)
         return RoundReport(title, len(chosen), correct, choosing, seconds, given_up)
@@ -252,6 +254,7 @@ class _Run:
             seconds=sum(r.seconds_choosing + r.seconds_matching for r in reports),
             given_up=sum(r.given_up for r in reports),
             matcher=self.matcher,
+            even_seconds=self.even_seconds,
         )
         return RoundsReport(matches, reports, self.budget)
 
