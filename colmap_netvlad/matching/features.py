@@ -15,12 +15,6 @@ from numpy.typing import NDArray
 SIFT_BYTES = 128
 """Length of a SIFT descriptor."""
 
-LARGEST = 2048
-"""Features of the first glance: those of the largest scales, which the other photo shows too
-where heights are like. With 1,024 a twentieth of the weak pairs on facades of buildings by the
-sea (corpus_christi) shows no consensus, with 2,048 none does."""
-
-
 BLOCK_FEATURES = 384
 """Most features of a block: of smaller ones the calls cost more than the products, for larger ones
 the windows grow."""

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from colmap_netvlad.matching.coarse import Consensus, Matches
 from colmap_netvlad.matching.features import SiftFeatures
-from colmap_netvlad.matching.nearest import MAX_RATIO, Nearest, nearest
+from colmap_netvlad.matching.nearest import Nearest, nearest
 
 MARGIN = 0.03
 """Around a predicted window, share of the diagonal of the photo looked in."""
@@ -50,7 +50,7 @@ class Guide:
     @classmethod
     def of(cls, start: NDArray[np.float64], end: NDArray[np.float64], margin: float) -> Guide:
         """Fit the guide to (S, 2) places that lie at (S, 2) in the other photo."""
-        affine = np.linalg.lstsq(_ones(start), end, rcond=None)[0]
+        affine = np.linalg.lstsq(_ones(start), end, rcond=None)[0].astype(float)
         return cls(affine, start, end - _ones(start) @ affine, margin)
 
     def near(self, centres: NDArray[np.float64]) -> tuple[Places, Places]:
@@ -60,18 +60,22 @@ class Guide:
         return offsets.min(axis=1), offsets.max(axis=1)
 
 
-def search(one: SiftFeatures, other: SiftFeatures, agreed: Consensus) -> Matches:
-    """Return (M, 2) matches that pass the ratio test both ways in their windows."""
+def search(
+    one: SiftFeatures, other: SiftFeatures, agreed: Consensus, max_ratio: float
+) -> tuple[Matches, NDArray[np.float32]]:
+    """Return (M, 2) matches that pass the ratio test both ways in their windows; (M,) the larger
+    of their two ratios."""
     guides = agreed.matches[agreed.support >= SUPPORT]
     start, end = one.at[guides[:, 0]].astype(float), other.at[guides[:, 1]].astype(float)
     there = _search(one, np.ones(len(one), bool), other, Guide.of(start, end, _margin(other)))
-    i = np.flatnonzero(there.distinct(MAX_RATIO))
+    i = np.flatnonzero(there.distinct(max_ratio))
     j = there.best[i]
     wanted = np.zeros(len(other), bool)
     wanted[j] = True
     back = _search(other, wanted, one, Guide.of(end, start, _margin(one)))
-    keep = back.distinct(MAX_RATIO)[j] & (back.best[j] == i)
-    return np.stack([i[keep], j[keep]], axis=1)
+    keep = back.distinct(max_ratio)[j] & (back.best[j] == i)
+    i, j = i[keep], j[keep]
+    return np.stack([i, j], axis=1), np.maximum(there.ratio[i], back.ratio[j])
 
 
 def _search(
@@ -80,7 +84,7 @@ def _search(
     """Return the neighbours of all features of `one`, looked for where they are wanted."""
     best = np.full(len(one), -1, np.intp)
     angle, ratio = np.full((2, len(one)), np.inf, np.float32)
-    carried = _ones(one.at) @ guide.affine
+    carried = _ones(one.at.astype(float)) @ guide.affine
     x, y = other.at.T.copy()
     corners = np.nanmin(other.at, axis=0), np.nanmax(other.at, axis=0)
     low, high = guide.near(np.array([one.at[block].mean(axis=0) for block in one.blocks]))
