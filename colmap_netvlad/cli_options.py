@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 from click.core import ParameterSource
 
+from colmap_netvlad.matching.options import MATCHER_DEFAULT, MatchOptions
 from colmap_netvlad.retrieval.options import COMPARED, GPS_MODES, RetrievalOptions
 from colmap_netvlad.terminal import VERBOSE
 
 if TYPE_CHECKING:
     from colmap_netvlad.colmap.features import FeatureOptions
-    from colmap_netvlad.matching.options import MatchOptions
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
@@ -214,7 +214,8 @@ MATCHER: tuple[Callable[[Any], Any], ...] = (
     click.option(
         "--matcher",
         help="Who matches: colmap (COLMAP's own), or guided (a glance tells where two photos"
-        " overlap, and features are looked for only there).  [default: colmap]",
+        " overlap, and features are looked for only there)."
+        f"  [default: {MATCHER_DEFAULT}]",
     ),
     click.option(
         "--thorough",
@@ -227,7 +228,6 @@ MATCHER: tuple[Callable[[Any], Any], ...] = (
 
 def _match_options(matcher: str | None, thorough: bool, seed: int = 0) -> dict[str, MatchOptions]:
     from colmap_netvlad.matching.matchers import find_matcher
-    from colmap_netvlad.matching.options import MatchOptions
 
     matching = MatchOptions(matcher, thorough, seed)
     find_matcher(matching)

@@ -386,7 +386,7 @@ def test_features_that_are_not_sift_go_to_colmap(
     monkeypatch.setitem(MATCHERS, "colmap", row)
     report = match_pairs(database, all_pairs(database, 3), GUIDED)
     assert colmap.match_by_colmap is not instead and len(asked) == 1
-    assert report.matcher == "colmap" and "COLMAP's matcher does it" in caplog.messages[0]
+    assert report.matcher == "colmap" and "COLMAP's matcher is used" in caplog.messages[0]
 
 
 def test_a_database_without_descriptors_goes_to_colmap(

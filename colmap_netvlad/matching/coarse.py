@@ -122,7 +122,8 @@ def neighbours_agree(one: SiftFeatures, other: SiftFeatures, matches: Matches) -
     at = one.at[matches[:, 0]]
     nearest_matches = cKDTree(at).query(at, min(NEIGHBOURS + 1, len(at)))[1][:, 1:]
     rows = np.repeat(np.arange(len(at)), nearest_matches.shape[1])
-    predicted = _predicted(one, other, matches, rows, nearest_matches.ravel())
+    columns = nearest_matches.ravel()
+    predicted = _predicted(one, other, matches, rows, columns) & (rows != columns)
     return predicted.reshape(nearest_matches.shape).any(axis=1)
 
 

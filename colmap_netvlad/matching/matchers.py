@@ -113,6 +113,6 @@ def usable_matcher(options: MatchOptions, sift: bool) -> tuple[Matcher, str]:
     if sift or not matcher.sift_only:
         return matcher, ""
     return MATCHERS["colmap"], (
-        f"The matcher {matcher.name} takes SIFT only, which the database's local features are "
-        "not; COLMAP's matcher does it."
+        f"The matcher {matcher.name} needs SIFT descriptors and no others, which this database "
+        "does not have; COLMAP's matcher is used."
     )

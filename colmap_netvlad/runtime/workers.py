@@ -57,7 +57,7 @@ class Outcome:
     Attributes:
         fault: why it failed, or None.
         peak_bytes: the most memory its process held; 0 where it crashed.
-        seconds: how long its function ran, s; 0 where its process crashed.
+        seconds: how long its initialiser and function ran, s; 0 where its process crashed.
     """
 
     fault: str | None = None
