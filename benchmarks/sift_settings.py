@@ -25,7 +25,8 @@ from colmap_netvlad.colmap import engine
 from colmap_netvlad.colmap.database import image_names, open_database
 from colmap_netvlad.mapping.incremental import map_incremental
 from colmap_netvlad.mapping.summary import combine
-from colmap_netvlad.matching.run import MatchOptions, match_pairs
+from colmap_netvlad.matching.options import MatchOptions
+from colmap_netvlad.matching.run import match_pairs
 from colmap_netvlad.pairs.lists import read_pairs
 from colmap_netvlad.photos.files import find_photos
 from colmap_netvlad.terminal import Command

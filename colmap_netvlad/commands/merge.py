@@ -26,7 +26,8 @@ from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.mapping.output import free_output, model_folder
 from colmap_netvlad.mapping.summary import ModelSummary, summarize
 from colmap_netvlad.mapping.together import join_and_adjust
-from colmap_netvlad.matching.run import MatchOptions, MatchReport, match_pairs
+from colmap_netvlad.matching.options import MatchOptions
+from colmap_netvlad.matching.run import MatchReport, match_pairs
 from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval.options import RetrievalOptions
 from colmap_netvlad.retrieval.rank import rank_project
