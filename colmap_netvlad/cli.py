@@ -8,7 +8,6 @@ commands share stand in `cli_options`.
 from __future__ import annotations
 
 import json
-import shlex
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -41,6 +40,7 @@ from colmap_netvlad.cli_settings import SettingsCommand
 from colmap_netvlad.retrieval.options import RetrievalOptions
 from colmap_netvlad.runtime.errors import EXIT_PARTIAL
 from colmap_netvlad.runtime.plain import plain
+from colmap_netvlad.runtime.shell import command_line
 from colmap_netvlad.runtime.version import VERSION
 from colmap_netvlad.terminal import Group, say
 
@@ -111,7 +111,8 @@ def features(images: Path, database: Path, features: FeatureOptions, masks: Path
 
     report = import_photos(images, database, replace(features, masks=masks))
     say(*report_lines(report, database))
-    click.echo(f"Next: colmap-netvlad pairs --db {quoted(database)}")
+    words = ["colmap-netvlad", "pairs", "--db", str(database)]
+    click.echo(f"Next: {command_line(words)}")
     finish_partial([f"Left out: {name} {reason}" for name, reason in report.bad])
 
 
@@ -568,11 +569,6 @@ def train(
     report = run(scenes, measured, options, output, device=device, name=name)
     say(*report_lines(report))
     finish_partial(report.left_out)
-
-
-def quoted(path: Path) -> str:
-    """Return a path as the user's shell takes it."""
-    return shlex.quote(str(path))
 
 
 def print_json(report: Any) -> None:

@@ -107,7 +107,7 @@ def load_model(name_or_path: str | Path, device: str | None = None) -> Descripto
     Args:
         name_or_path: a name in `CATALOGUE`, a .safetensors checkpoint, or the published
             Pitts30K_struct.mat (see `netvlad_matlab`).
-        device: cpu, cuda, cuda:1, mps; None takes the fastest there is.
+        device: cpu, cuda, cuda:1, mps; None: cuda where there is one, else cpu.
 
     Raises:
         InputError: no such model or file, not a checkpoint, truncated, of another version,
