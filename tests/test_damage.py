@@ -198,3 +198,15 @@ def test_lists_that_are_none_are_one_sentence(name: str, text: str, tmp_path: Pa
     (tmp_path / name).write_text(text)
     with pytest.raises(InputError, match="is not a pairs list: "):
         read_pairs(tmp_path / name, ["a.jpg", "b.jpg"])
+
+
+def test_what_colmap_refuses_is_one_sentence(project_copy: MakeProject) -> None:
+    project = project_copy(matched=True)
+    execute(project.database, "UPDATE two_view_geometries SET tvec = x'000000' WHERE rows > 0")
+    a, b = image_names(project.database)[:2]
+    project.pairs.write_text(f"{a} {b}\n")
+    arguments = ["reconstruct", "--db", str(project.database), "--mapper", "incremental"]
+    result = CliRunner().invoke(cli, arguments)
+    assert result.exit_code == 1 and isinstance(result.exception, SystemExit)
+    assert "Error: COLMAP stopped: " in result.stderr and "restore it from a copy" in result.stderr
+    assert not project.sparse.exists()
