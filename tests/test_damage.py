@@ -210,3 +210,31 @@ def test_what_colmap_refuses_is_one_sentence(project_copy: MakeProject) -> None:
     assert result.exit_code == 1 and isinstance(result.exception, SystemExit)
     assert "Error: COLMAP stopped: " in result.stderr and "restore it from a copy" in result.stderr
     assert not project.sparse.exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "method"),
+    [
+        ("UPDATE codebooks SET dim = x'00'", "vlad"),
+        ("UPDATE codebooks SET images = 'many'", "vlad"),
+        ("UPDATE codebooks SET words = x'00'", "vlad"),
+        ("UPDATE descriptors SET vector = x'0000' WHERE rowid = 2", "vlad"),
+        ("UPDATE photos SET stamp = 7, gps = x'00'", "hybrid"),
+        ("UPDATE settings SET value = x'00'", "random"),
+    ],
+)
+def test_a_damaged_cache_is_one_sentence_that_says_to_delete_it(
+    change: str, method: str, project_copy: MakeProject
+) -> None:
+    project = project_copy()
+    arguments = ["pairs", "--db", str(project.database), "--method", "vlad", "--k", "3"]
+    assert CliRunner().invoke(cli, arguments).exit_code == 0
+    execute(
+        project.cache,
+        "INSERT OR REPLACE INTO photos VALUES ('a', '1 1', NULL, NULL)",
+        "INSERT OR REPLACE INTO settings VALUES ('images', 'images')",
+        change,
+    )
+    result = CliRunner().invoke(cli, [*arguments[:4], method, "--k", "3"])
+    assert result.exit_code == 1 and isinstance(result.exception, SystemExit), result.output
+    assert "is damaged" in result.stderr and "delete it: descriptors are computed" in result.stderr
