@@ -8,7 +8,6 @@ commands share stand in `cli_options`.
 from __future__ import annotations
 
 import json
-import shlex
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -46,6 +45,7 @@ from colmap_netvlad.cli_settings import SettingsCommand
 from colmap_netvlad.retrieval.options import RetrievalOptions
 from colmap_netvlad.runtime.errors import EXIT_PARTIAL
 from colmap_netvlad.runtime.plain import plain
+from colmap_netvlad.runtime.shell import command_line
 from colmap_netvlad.runtime.version import VERSION
 from colmap_netvlad.terminal import Group, say
 
@@ -120,7 +120,8 @@ def features(images: Path, database: Path, features: FeatureOptions, masks: Path
 
     report = import_photos(images, database, replace(features, masks=masks))
     say(*report_lines(report, database))
-    click.echo(f"Next: colmap-netvlad pairs --db {quoted(database)}")
+    words = ["colmap-netvlad", "pairs", "--db", str(database)]
+    click.echo(f"Next: {command_line(words)}")
     finish_partial([f"Left out: {name} {reason}" for name, reason in report.bad])
 
 
@@ -302,7 +303,7 @@ def reconstruct(
         matching,
         replace(world, gcp=gcp),
         drop_contradicted,
-        command_line(),
+        given_command(),
     )
     report = run(project, pairs, output, options, rounds)
     if as_json:
@@ -364,7 +365,7 @@ def add(
         replace(features, masks=retrieval.masks),
         retrieval.seed,
         matching,
-        command_line(),
+        given_command(),
     )
     report = add_photos(project, sparse, options, output)
     say(*add_lines(report))
@@ -401,9 +402,9 @@ def say_verdict(reports: Sequence[FlightReport]) -> None:
     say(*(f"Report of a smaller model: {other.page}" for other in reports[1:]))
 
 
-def command_line() -> str:
+def given_command() -> str:
     """Return the command as the user gave it."""
-    return shlex.join(["colmap-netvlad", *sys.argv[1:]])
+    return command_line(["colmap-netvlad", *sys.argv[1:]])
 
 
 @cli.command()
@@ -768,11 +769,6 @@ def train(
     report = run(scenes, measured, options, output, device=device, name=name)
     say(*report_lines(report))
     finish_partial(report.left_out)
-
-
-def quoted(path: Path) -> str:
-    """Return a path as the user's shell takes it."""
-    return shlex.quote(str(path))
 
 
 def print_json(report: Any) -> None:

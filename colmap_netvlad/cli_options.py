@@ -57,7 +57,9 @@ seed_option = click.option(
     "--seed", default=0, show_default=True, help="Seed of every random choice."
 )
 device_option = click.option(
-    "--device", help="Where networks run: cpu, cuda, cuda:1, mps.  [default: the fastest there is]"
+    "--device",
+    help="Where networks run: cpu, cuda, cuda:1, mps.  [default: cuda where there is one, else"
+    " cpu]",
 )
 masks_option = click.option(
     "--masks",

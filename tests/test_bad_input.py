@@ -300,6 +300,16 @@ def test_ctrl_c_in_features_is_clean_and_the_next_run_completes(stage: str, tmp_
         assert len(colmap.images_with_features()) == 4
 
 
+def test_ctrl_c_while_a_vocabulary_tree_is_built_is_clean(project_copy: MakeProject) -> None:
+    project = project_copy()
+    arguments = ("pairs", "--db", project.database, "--method", "bow", "--k", 3)
+    before = content(project.folder)
+    interrupted("colmap_netvlad.runtime.workers:wait", *arguments)  # in its own process
+    assert_no_leftovers(project.folder)
+    assert content(project.folder).items() >= before.items()
+    assert run(*arguments).exit_code == 0 and project.pairs.exists()
+
+
 @pytest.mark.parametrize(
     "stage, matcher",
     [

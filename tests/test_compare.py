@@ -9,12 +9,14 @@ import shutil
 import sqlite3
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from colmap_netvlad.cache.ranking import Ranking
 from colmap_netvlad.cli import cli
 from colmap_netvlad.commands import compare as pipeline
 from colmap_netvlad.commands.compare import CompareOptions
@@ -448,3 +450,18 @@ def test_methods_that_run_a_shipped_model_are_compared(no_page, project_copy: Ma
     comparison, _ = compare(project_copy(), [name, "vlad"], FAST)
     assert not comparison.incomplete
     assert comparison.methods[0].name == name and comparison.methods[0].at_k[0].pairs > 0
+
+
+def test_a_kept_ranking_is_the_one_that_was_kept(tmp_path: Path) -> None:
+    workspace = Workspace(tmp_path)
+    partners = np.array([[1, 2], [0, -1], [0, 1]], np.int32)
+    scores = np.where(partners < 0, -np.inf, 0.5).astype(np.float32)
+    ranking = Ranking(
+        ("a", "b", "c"), partners, scores, "hybrid", 1.5, 2.5, ("note",), (("b", "blurred"),),
+        compared=True, every_pair=True,
+    )  # fmt: skip
+    workspace.save_ranking("hybrid", ranking, True)
+    kept, timed_earlier = workspace.load_ranking("hybrid") or (None, False)
+    assert kept is not None and timed_earlier
+    for field in fields(Ranking):
+        assert np.array_equal(getattr(kept, field.name), getattr(ranking, field.name)), field.name

@@ -100,7 +100,9 @@ def test_a_waiting_write_ahead_log_is_read_too(database: Path) -> None:
 
 def test_features_of_another_kind_are_one_sentence(database: Path) -> None:
     with closing(sqlite3.connect(database)) as connection:
-        connection.execute("UPDATE descriptors SET cols = 512 WHERE image_id = 1")
+        connection.execute(
+            "UPDATE descriptors SET cols = 512, data = zeroblob(rows * 512) WHERE image_id = 1"
+        )
         connection.commit()
     with open_database(database) as db, pytest.raises(InputError, match="512 bytes, not SIFT's"):
         db.sift_descriptors(1)

@@ -1,11 +1,17 @@
 """Files appear whole or not at all."""
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
+from colmap_netvlad.mapping.output import model_folder
+from colmap_netvlad.runtime import files
 from colmap_netvlad.runtime.errors import InputError
-from colmap_netvlad.runtime.files import atomic_path, write_atomically
+from colmap_netvlad.runtime.files import atomic_path, scratch_folder, write_atomically
+from colmap_netvlad.runtime.shell import command_line
 
 
 def test_content_replaces_what_was_there(tmp_path: Path) -> None:
@@ -54,3 +60,45 @@ def test_a_folder_that_cannot_be_made_is_one_sentence(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="Cannot write"):
         write_atomically(tmp_path / "file" / "pairs.txt", "x")
+
+
+KILLED = """
+import os, sys
+from pathlib import Path
+from colmap_netvlad.mapping.output import model_folder
+from colmap_netvlad.runtime.files import atomic_path, scratch_folder
+with model_folder(Path(sys.argv[1], "sparse")) as model, scratch_folder() as scratch:
+    Path(model, "points3D.bin").touch()
+    Path(scratch, "features.db").touch()
+    with atomic_path(Path(sys.argv[1], "pairs.txt")):
+        os.kill(os.getpid(), 9)
+"""
+
+
+def test_what_a_killed_process_left_goes_with_the_next_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    work, scratch = tmp_path / "work", tmp_path / "scratch"
+    work.mkdir()
+    scratch.mkdir()
+    monkeypatch.setattr(files.tempfile, "tempdir", str(scratch))
+    environment = {**os.environ, "TMPDIR": str(scratch)}
+    subprocess.run([sys.executable, "-c", KILLED, work], env=environment, check=False)
+    assert len(list(work.iterdir())) == 2 and len(list(scratch.iterdir())) == 1
+    foreign = [work / ".sparse.clusters", work / ".sparse.other-machine-1-x", work / "sparse-1"]
+    for folder in foreign:
+        folder.mkdir()
+    with atomic_path(work / "pairs.txt") as living:
+        write_atomically(work / "pairs.txt", "a b\n")  # a living process keeps what it writes
+        assert living.exists()
+    with model_folder(work / "sparse"), scratch_folder():
+        pass
+    assert sorted(work.iterdir()) == sorted([*foreign, work / "sparse", work / "pairs.txt"])
+    assert list(scratch.iterdir()) == []
+
+
+def test_hints_are_quoted_for_the_shell_at_hand(monkeypatch: pytest.MonkeyPatch) -> None:
+    words = ["colmap-netvlad", "pairs", "--db", "my flight.db"]
+    assert command_line(words) == "colmap-netvlad pairs --db 'my flight.db'"
+    monkeypatch.setattr(os, "name", "nt")
+    assert command_line(words) == 'colmap-netvlad pairs --db "my flight.db"'

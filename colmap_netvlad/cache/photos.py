@@ -30,11 +30,16 @@ def contents(store: Store, files: Mapping[str, Path]) -> tuple[dict[str, str], d
 def gps_positions(store: Store, files: Mapping[str, Path]) -> dict[str, PosePrior]:
     """Return the EXIF GPS of photos that have any; see `photos.positions.read_gps`."""
     seen, _ = _look(store, files, lambda photo: photo.gps is not None, _with_gps)
-    return {
-        key: PosePrior(tuple(json.loads(photo.gps)), CoordinateSystem.WGS84)
-        for key, photo in seen.items()
-        if photo.gps
-    }
+    found = {key: _prior(photo.gps) for key, photo in seen.items() if photo.gps}
+    return {key: prior for key, prior in found.items() if prior is not None}
+
+
+def _prior(text: str) -> PosePrior | None:
+    try:
+        latitude, longitude, height = map(float, json.loads(text))
+    except (TypeError, ValueError):  # a damaged cache
+        return None
+    return PosePrior((latitude, longitude, height), CoordinateSystem.WGS84)
 
 
 def _look(

@@ -99,8 +99,13 @@ class Store:
     def photos(self) -> dict[str, SeenPhoto]:
         """Return what is known of photo files, by the key they were kept under."""
         with self._faults():
-            rows = self._db.execute("SELECT file, stamp, content, gps FROM photos")
-            return {file: SeenPhoto(*rest) for file, *rest in rows.fetchall()}
+            rows = self._db.execute("SELECT file, stamp, content, gps FROM photos").fetchall()
+            return {
+                file: SeenPhoto(
+                    _text_or_none(stamp) or "", _text_or_none(content), _text_or_none(gps)
+                )
+                for file, stamp, content, gps in rows
+            }
 
     def keep_photos(self, seen: Mapping[str, SeenPhoto]) -> None:
         """Keep what is known of photo files in one transaction."""
@@ -175,7 +180,7 @@ class Store:
                 "SELECT image, seconds FROM descriptors WHERE model = ?", [model]
             )
             spent = dict(rows.fetchall())
-        return sum(spent[name] for name in names)
+            return float(sum(spent[name] for name in names))
 
     def vectors(self, model: str, names: Sequence[str]) -> StoredVectors:
         """Return the descriptors of these images as rows that are read when they are sliced."""
@@ -195,7 +200,9 @@ class Store:
                 if row is None:
                     raise KeyError(name)
                 blobs.append(row[0])
-        return np.frombuffer(b"".join(blobs), np.float16).reshape(len(blobs), -1)
+            if len({len(blob) for blob in blobs}) > 1:
+                raise ValueError("descriptors of different lengths")
+            return np.frombuffer(b"".join(blobs), np.float16).reshape(len(blobs), -1)
 
     # Cells: what networks saw, place by place
 
@@ -224,10 +231,10 @@ class Store:
             row = self._db.execute(
                 "SELECT height, width, codes FROM cells WHERE number = ?", [number]
             ).fetchone()
-        if row is None:
-            raise KeyError(number)
-        height, width, codes = row
-        return Cells(np.frombuffer(codes, np.int8).reshape(height, width, -1))
+            if row is None:
+                raise KeyError(number)
+            height, width, codes = row
+            return Cells(np.frombuffer(codes, np.int8).reshape(height, width, -1))
 
     def agreements(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
         """Return what was counted so far, in the order of the numbers.
@@ -258,9 +265,9 @@ class Store:
             row = self._db.execute(
                 "SELECT words, dim, images FROM codebooks WHERE key = ?", [key]
             ).fetchone()
-        if row is None:
-            return None
-        return np.frombuffer(row[0], np.float32).reshape(-1, row[1]), row[2]
+            if row is None:
+                return None
+            return np.frombuffer(row[0], np.float32).reshape(-1, row[1]), int(row[2])
 
     def keep_codebook(self, key: str, words: NDArray[np.float32], images: int) -> None:
         """Keep (K, dim) words learned on `images` images."""
@@ -274,7 +281,7 @@ class Store:
         """Return a remembered value, or None."""
         with self._faults():
             row = self._db.execute("SELECT value FROM settings WHERE key = ?", [key]).fetchone()
-        return None if row is None else row[0]
+            return None if row is None else _text_or_none(row[0])
 
     def remember(self, key: str, value: str) -> None:
         """Remember a value under a key; writes only where it differs."""
@@ -382,7 +389,7 @@ class Store:
             yield
         except sqlite3.OperationalError as fault:
             raise InputError(_sentence(self.path, str(fault))) from fault
-        except sqlite3.DatabaseError as fault:
+        except (sqlite3.DatabaseError, TypeError, ValueError, OverflowError) as fault:
             raise InputError(
                 f"The cache {self.path} is damaged ({fault}); delete it: descriptors are computed "
                 "again, nothing else is lost."
@@ -412,6 +419,12 @@ def remembered_images(cache: Path) -> Path | None:
     with Store(cache) as store:
         folder = store.setting(IMAGES_SETTING)
     return None if folder is None else cache.parent / folder
+
+
+def _text_or_none(value: object) -> str | None:
+    if value is None or isinstance(value, str):
+        return value
+    raise TypeError(f"{type(value).__name__} in place of a text")
 
 
 def _sentence(path: Path, fault: str) -> str:

@@ -15,10 +15,12 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
+from colmap_netvlad.photos.files import leaves_folder
 from colmap_netvlad.photos.positions import CoordinateSystem, PosePrior
 from colmap_netvlad.runtime.errors import InputError
 
@@ -36,6 +38,11 @@ SIFT_BYTES = 128
 
 SIFT_TYPE = 0
 """`descriptors.type` of SIFT (COLMAP 4 on); -1 where a database was made before."""
+
+SYSTEMS = frozenset(CoordinateSystem)
+
+VALUE_BYTES = {"keypoints": 4, "descriptors": 1, "matches": 4, "two_view_geometries": 4}
+"""Bytes of one value in a table's `data`, a blob of `rows` times `cols` values."""
 
 
 @dataclass(frozen=True)
@@ -93,12 +100,26 @@ class Database:
         self.path = path
 
     def images(self) -> list[ImageRow]:
-        """Return all images in the order of their ids."""
+        """Return all images in the order of their ids.
+
+        Raises:
+            InputError: a row is damaged, or a name leads out of the photo folder.
+        """
         rows = self.connection.execute(
             "SELECT i.image_id, i.name, i.camera_id, COALESCE(c.width, 0), COALESCE(c.height, 0)"
             " FROM images i LEFT JOIN cameras c USING (camera_id) ORDER BY i.image_id"
         )
-        return [ImageRow(*row) for row in rows]
+        images = []
+        for number, name, *rest in rows:
+            if not (isinstance(name, str) and all(isinstance(value, int) for value in rest)):
+                raise self._damaged("images", f"image {number}")
+            if leaves_folder(name):
+                raise InputError(
+                    f"Image {number} of {self.path} is called {name!r}, which leads out of the "
+                    "photo folder; rename it in the database, or restore the database."
+                )
+            images.append(ImageRow(number, name, *rest))
+        return images
 
     def cameras(self) -> dict[int, InitialCamera]:
         """Return the cameras by their ids."""
@@ -113,14 +134,20 @@ class Database:
         }
 
     def keypoint_counts(self) -> dict[int, int]:
-        """Return the number of keypoints by image id; images without features are absent."""
-        return dict(self.connection.execute("SELECT image_id, rows FROM keypoints WHERE rows > 0"))
+        """Return the number of keypoints by image id; images without features are absent.
+
+        Raises:
+            InputError: the keypoints of an image are damaged.
+        """
+        return self._counts("keypoints")
 
     def descriptor_counts(self) -> dict[int, int]:
-        """Return the number of local descriptors by image id; images without are absent."""
-        return dict(
-            self.connection.execute("SELECT image_id, rows FROM descriptors WHERE rows > 0")
-        )
+        """Return the number of local descriptors by image id; images without are absent.
+
+        Raises:
+            InputError: the descriptors of an image are damaged.
+        """
+        return self._counts("descriptors")
 
     def images_with_features(self) -> set[int]:
         """Return the ids of images whose features COLMAP would not extract again (even if 0)."""
@@ -130,36 +157,35 @@ class Database:
         return {image_id for (image_id,) in rows}
 
     def keypoints(self, image_id: int) -> NDArray[np.float32]:
-        """Return (N, 2) keypoint positions x, y in pixels (COLMAP's: centre of pixel 0 is 0.5)."""
+        """Return (N, 2) keypoint positions x, y in pixels (COLMAP's: centre of pixel 0 is 0.5).
+
+        Raises:
+            InputError: they are damaged.
+        """
         return self.keypoint_shapes(image_id)[:, :2]
 
     def keypoint_shapes(self, image_id: int) -> NDArray[np.float32]:
         """Return (N, 2), (N, 4) or (N, 6) keypoints: x, y; scale and orientation, or the four
-        numbers of an affine shape."""
-        row = self.connection.execute(
-            "SELECT rows, cols, data FROM keypoints WHERE image_id = ?", (image_id,)
-        ).fetchone()
-        if row is None or not row[0]:
-            return np.zeros((0, 2), np.float32)
-        return np.frombuffer(row[2], np.float32).reshape(row[0], row[1])
+        numbers of an affine shape.
+
+        Raises:
+            InputError: they are damaged.
+        """
+        return self._values("keypoints", "image_id", image_id, np.float32, 2)
 
     def sift_descriptors(self, image_id: int) -> NDArray[np.uint8]:
         """Return (N, 128) SIFT descriptors as COLMAP keeps them, 0..255.
 
         Raises:
-            InputError: the local features are of another kind (ALIKED, say).
+            InputError: the local features are of another kind (ALIKED, say), or damaged.
         """
-        row = self.connection.execute(
-            "SELECT rows, cols, data FROM descriptors WHERE image_id = ?", (image_id,)
-        ).fetchone()
-        if row is None or not row[0]:
-            return np.zeros((0, SIFT_BYTES), np.uint8)
-        if row[1] != SIFT_BYTES:
+        values = self._values("descriptors", "image_id", image_id, np.uint8, SIFT_BYTES)
+        if values.shape[1] != SIFT_BYTES:
             raise InputError(
-                f"{self.path} has local features of {row[1]} bytes, not SIFT's {SIFT_BYTES}; "
-                "use a method that reads the photos, or extract SIFT."
+                f"{self.path} has local features of {values.shape[1]} bytes, not SIFT's "
+                f"{SIFT_BYTES}; use a method that reads the photos, or extract SIFT."
             )
-        return np.frombuffer(row[2], np.uint8).reshape(row[0], SIFT_BYTES)
+        return values
 
     def has_sift(self) -> bool:
         """Whether there are SIFT descriptors and no others."""
@@ -186,29 +212,40 @@ class Database:
         }
 
     def matched_pairs(self) -> set[tuple[int, int]]:
-        """Return the pairs COLMAP's matchers would skip: those with matches and a geometry."""
+        """Return the pairs COLMAP's matchers would skip: those with matches and a geometry.
+
+        Pairs of images that the database does not have (any more) are left out.
+        """
         rows = self.connection.execute(
             "SELECT pair_id FROM matches INTERSECT SELECT pair_id FROM two_view_geometries"
         )
-        return {images_of_pair(pair) for (pair,) in rows}
+        known = self._image_ids()
+        return {pair for (found,) in rows if known.issuperset(pair := images_of_pair(found))}
 
     def verified_matches(self) -> dict[tuple[int, int], int]:
         """Return the number of verified (inlier) matches by pair of image ids, lower first.
 
-        Pairs that were tried and failed have 0.
+        Pairs that were tried and failed have 0; pairs of images that the database does not have
+        (any more) are left out.
+
+        Raises:
+            InputError: the matches of a pair are damaged.
         """
+        known = self._image_ids()
+        self._check_data("two_view_geometries", "pair_id")
         rows = self.connection.execute("SELECT pair_id, rows FROM two_view_geometries")
-        return {images_of_pair(pair): count for pair, count in rows}
+        return {
+            pair: count for found, count in rows if known.issuperset(pair := images_of_pair(found))
+        }
 
     def inlier_matches(self, image_id1: int, image_id2: int) -> NDArray[np.uint32]:
-        """Return (M, 2) keypoint indices of the verified matches, columns as the ids are given."""
-        row = self.connection.execute(
-            "SELECT rows, data FROM two_view_geometries WHERE pair_id = ?",
-            (pair_id(image_id1, image_id2),),
-        ).fetchone()
-        if row is None or not row[0]:
-            return np.zeros((0, 2), np.uint32)
-        matches = np.frombuffer(row[1], np.uint32).reshape(row[0], 2)
+        """Return (M, 2) keypoint indices of the verified matches, columns as the ids are given.
+
+        Raises:
+            InputError: they are damaged.
+        """
+        pair = pair_id(image_id1, image_id2)
+        matches = self._values("two_view_geometries", "pair_id", pair, np.uint32, 2)
         return matches if image_id1 <= image_id2 else matches[:, ::-1]
 
     def geometry(self, image_id1: int, image_id2: int) -> PairGeometry | None:
@@ -225,7 +262,8 @@ class Database:
         """Return the position priors by image id, from any COLMAP version.
 
         COLMAP 3.8 and 3.9 kept cartesian `images.prior_t*`; 3.10 on keeps `pose_priors`, keyed by
-        image until 3.13, by sensor data since 4.0. Priors that are not finite are left out.
+        image until 3.13, by sensor data since 4.0. Priors that are no three finite numbers are
+        left out.
         """
         columns = self._columns("pose_priors")
         if "corr_data_id" in columns:
@@ -241,9 +279,10 @@ class Database:
             return {}
         priors = {}
         for image_id, blob, system in self.connection.execute(query):
-            position = np.frombuffer(blob or b"", np.float64)
-            if position.size == 3 and np.isfinite(position).all():
-                x, y, z = position.tolist()
+            if not isinstance(blob, bytes) or len(blob) != 24 or system not in SYSTEMS:
+                continue
+            x, y, z = position = np.frombuffer(blob, np.float64).tolist()
+            if np.isfinite(position).all():
                 priors[image_id] = PosePrior((x, y, z), CoordinateSystem(system))
         return priors
 
@@ -272,19 +311,74 @@ class Database:
         return dict(
             self.connection.execute(
                 "SELECT data_id, frame_id FROM frame_data WHERE sensor_type = 0"
+                " AND typeof(data_id) || typeof(frame_id) = 'integerinteger'"
             )
         )
 
     def _legacy_priors(self) -> dict[int, PosePrior]:
         rows = self.connection.execute(
             "SELECT image_id, prior_tx, prior_ty, prior_tz FROM images"
-            " WHERE prior_tx IS NOT NULL AND prior_ty IS NOT NULL AND prior_tz IS NOT NULL"
+            " WHERE typeof(prior_tx) || typeof(prior_ty) || typeof(prior_tz) = 'realrealreal'"
         )
         return {
             image_id: PosePrior((x, y, z), CoordinateSystem.CARTESIAN)
             for image_id, x, y, z in rows
             if np.isfinite([x, y, z]).all()
         }
+
+    def _image_ids(self) -> set[int]:
+        return {number for (number,) in self.connection.execute("SELECT image_id FROM images")}
+
+    def _counts(self, table: str) -> dict[int, int]:
+        self._check_data(table, "image_id")
+        return dict(self.connection.execute(f"SELECT image_id, rows FROM {table} WHERE rows > 0"))
+
+    def _values(
+        self, table: str, key: str, number: int, dtype: DTypeLike, columns: int
+    ) -> NDArray[Any]:
+        """Return the `rows` x `cols` values of one image or pair, (0, columns) where none are."""
+        self._check_data(table, key, number)
+        row = self.connection.execute(
+            f"SELECT rows, cols, data FROM {table} WHERE {key} = ?", (number,)
+        ).fetchone()
+        if row is None or not row[0]:
+            return np.zeros((0, columns), dtype)
+        return np.frombuffer(row[2], dtype).reshape(row[0], row[1])
+
+    def _check_data(self, table: str, key: str, number: int | None = None) -> None:
+        """Make sure that `data` is as long as `rows` and `cols` say, of one row or of all.
+
+        sqlite knows a blob's type and length without reading it.
+
+        Raises:
+            InputError: it is not.
+        """
+        query = (
+            f"SELECT {key} FROM {table} WHERE (typeof(rows) <> 'integer' OR rows < 0 OR rows > 0"
+            " AND (typeof(cols) <> 'integer' OR cols < 2 OR typeof(data) <> 'blob'"
+            f" OR length(data) <> rows * cols * {VALUE_BYTES[table]}"
+            f"{' OR cols <> 2' if key == 'pair_id' else ''}))"
+        )
+        if number is None:
+            row = self.connection.execute(f"{query} LIMIT 1").fetchone()
+        else:
+            row = self.connection.execute(f"{query} AND {key} = ?", (number,)).fetchone()
+        if row is not None:
+            whose = images_of_pair(row[0]) if key == "pair_id" else (row[0],)
+            raise self._damaged(table, " and ".join(map(self._image, whose)))
+
+    def _image(self, number: int) -> str:
+        row = self.connection.execute(
+            "SELECT name FROM images WHERE image_id = ?", (number,)
+        ).fetchone()
+        return f"image {number}" if row is None else f"image {number} ({row[0]})"
+
+    def _damaged(self, table: str, whose: str) -> InputError:
+        return InputError(
+            f"{self.path} is damaged: what table {table} has of {whose} cannot be right; restore "
+            "the database from a copy, or delete this image there and run `colmap-netvlad "
+            "features` again."
+        )
 
     def _columns(self, table: str) -> set[str]:
         return {row[1] for row in self.connection.execute(f"PRAGMA table_info({table})")}

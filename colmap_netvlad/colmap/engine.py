@@ -15,8 +15,8 @@ import shutil
 import sqlite3
 import tempfile
 import threading
-from collections.abc import Callable
-from contextlib import closing
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -83,7 +83,7 @@ def call(function: Callable[..., Result], folder: Path, *arguments: Any, **optio
         folder: where it writes; its disk space is watched.
 
     Raises:
-        InputError: the disk is nearly full.
+        InputError: the disk is nearly full, or COLMAP refuses what it reads.
         KeyboardInterrupt: Ctrl-C.
     """
     silence()
@@ -113,8 +113,38 @@ def call(function: Callable[..., Result], folder: Path, *arguments: Any, **optio
         raise
     thread.join()
     if faults:
-        raise faults[0]
+        with faults_said():
+            raise faults[0]
     return outcome[0]
+
+
+def make_or_migrate(database: Path) -> None:
+    """Let COLMAP make a database, or bring an old one up to its own schema.
+
+    Raises:
+        InputError: COLMAP cannot read it.
+    """
+    silence()
+    with faults_said():
+        pycolmap.Database.open(database).close()
+
+
+@contextmanager
+def faults_said() -> Iterator[None]:
+    """Say in a sentence what COLMAP itself raises in the block.
+
+    Raises:
+        InputError: instead of COLMAP's exceptions.
+    """
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as fault:
+        raise InputError(
+            f"COLMAP stopped: {' '.join(str(fault).split())} Where the database is damaged "
+            "(sqlite3's `PRAGMA integrity_check` says so), restore it from a copy."
+        ) from fault
 
 
 def silence() -> None:

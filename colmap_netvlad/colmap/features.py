@@ -298,8 +298,9 @@ def _import(
     reader.camera_model = options.camera_model
     if group.camera_id is not None:
         reader.existing_camera_id = group.camera_id
-    pycolmap.Database.open(database).close()  # makes it where it is not there
-    pycolmap.import_images(database, images, group.mode, list(names), reader)
+    engine.make_or_migrate(database)
+    with engine.faults_said():
+        pycolmap.import_images(database, images, group.mode, list(names), reader)
     if group.mode == pycolmap.CameraMode.SINGLE and group.camera_id is None:
         group.camera_id = _camera_of(database, names)
 

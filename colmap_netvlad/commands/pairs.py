@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -35,6 +34,7 @@ from colmap_netvlad.retrieval.fusion import similarity_matrix
 from colmap_netvlad.retrieval.options import COMPARED, RetrievalOptions
 from colmap_netvlad.retrieval.rank import export_descriptors, rank
 from colmap_netvlad.runtime.errors import InputError
+from colmap_netvlad.runtime.shell import command_line
 
 NO_RULES = PartnerRules()
 SUFFIXES = {"colmap": ".txt", "csv": ".csv", "json": ".json"}
@@ -237,7 +237,7 @@ def _next_command(project: Project, report: PairsReport) -> str:
     words = ["colmap-netvlad", "reconstruct", "--db", str(project.database)]
     if report.output != project.pairs:
         words += ["--pairs", str(report.output)]
-    return shlex.join(words)
+    return command_line(words)
 
 
 def _protect(output: Path, project: Project) -> None:

@@ -139,6 +139,8 @@ class Workspace:
                 float(kept["seconds_search"]),
                 tuple(kept["notes"].tolist()),
                 tuple((name, reason) for name, reason in kept["left_out"].tolist()),
+                "compared" in kept and bool(kept["compared"]),
+                "every_pair" in kept and bool(kept["every_pair"]),
             )
             return ranking, bool(kept["timed_earlier"])
 
@@ -155,6 +157,8 @@ class Workspace:
                 seconds_search=ranking.seconds_search,
                 notes=np.array(ranking.notes, dtype=np.str_),
                 left_out=np.array(ranking.left_out, dtype=np.str_).reshape(-1, 2),
+                compared=ranking.compared,
+                every_pair=ranking.every_pair,
                 timed_earlier=timed_earlier,
             )
 

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from colmap_netvlad.runtime.errors import InputError
+from colmap_netvlad.runtime.files import temporary_prefix
 
 
 @contextmanager
@@ -22,7 +23,8 @@ def model_folder(output: Path) -> Iterator[Path]:
         raise InputError(f"{output} exists already and is left as it is; name another `output`.")
     try:
         output.parent.mkdir(parents=True, exist_ok=True)
-        temporary = Path(tempfile.mkdtemp(prefix=f".{output.name}.", dir=output.parent))
+        prefix = temporary_prefix(output)
+        temporary = Path(tempfile.mkdtemp(prefix=prefix, dir=output.parent))
     except OSError as fault:
         raise InputError(f"Cannot write {output}: {fault.strerror or fault}.") from fault
     try:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
@@ -107,7 +109,7 @@ def load_model(name_or_path: str | Path, device: str | None = None) -> Descripto
     Args:
         name_or_path: a name in `CATALOGUE`, a .safetensors checkpoint, or the published
             Pitts30K_struct.mat (see `netvlad_matlab`).
-        device: cpu, cuda, cuda:1, mps; None takes the fastest there is.
+        device: cpu, cuda, cuda:1, mps; None: cuda where there is one, else cpu.
 
     Raises:
         InputError: no such model or file, not a checkpoint, truncated, of another version,
@@ -150,21 +152,29 @@ def _load(path: Path) -> tuple[GlobalDescriptor, dict[str, Any]]:
 
         return netvlad_matlab.load(path), netvlad_matlab.CARD
     card, state = _read(path, weights=True)
+    # Shapes first, without memory: a damaged card may ask for any size.
+    with torch.device("meta"):
+        _check_shapes(_built(path, card), state, path)
+    network = _built(path, card)
+    network.load_state_dict({key: value.float() for key, value in state.items()}, strict=False)
+    return network, card
+
+
+def _built(path: Path, card: dict[str, Any]) -> GlobalDescriptor:
+    """Make the network that a card describes."""
     try:
         trunk = build_trunk(card["backbone"], Normalisation.from_dict(card["normalisation"]))
         aggregation = build_aggregation(trunk.channels, card["aggregation"])
         whitening = Whitening(aggregation.dim, card["whitening"]) if card.get("whitening") else None
-    except (KeyError, TypeError) as fault:
+        return GlobalDescriptor(trunk, aggregation, whitening)
+    except (KeyError, TypeError, ValueError, RuntimeError) as fault:
         raise InputError(
             f"{path} is a checkpoint with a network this version does not know "
             f"({fault}; aggregations are {', '.join(AGGREGATIONS)}): update colmap-netvlad."
         ) from fault
-    network = GlobalDescriptor(trunk, aggregation, whitening)
-    _load_state(network, state, path)
-    return network, card
 
 
-def _load_state(network: GlobalDescriptor, state: dict[str, Tensor], path: Path) -> None:
+def _check_shapes(network: GlobalDescriptor, state: dict[str, Tensor], path: Path) -> None:
     for key, value in network.state_dict().items():
         if key.endswith("num_batches_tracked"):
             continue
@@ -175,7 +185,6 @@ def _load_state(network: GlobalDescriptor, state: dict[str, Tensor], path: Path)
                 f"{path} contradicts itself: {key} is {tuple(state[key].shape)}, its metadata "
                 f"asks for {tuple(value.shape)}."
             )
-    network.load_state_dict({key: value.float() for key, value in state.items()}, strict=False)
 
 
 def _read(path: Path, *, weights: bool) -> tuple[dict[str, Any], dict[str, Tensor]]:
@@ -198,7 +207,14 @@ def _card(path: Path, text: str | None) -> dict[str, Any]:
         raise InputError(
             f"{path} is not a colmap-netvlad checkpoint: a safetensors file without its metadata."
         )
-    card = json.loads(text)
+    try:
+        card = json.loads(text)
+    except (ValueError, RecursionError) as fault:
+        raise InputError(
+            f"{path} is a damaged checkpoint: its card is no JSON ({fault})."
+        ) from fault
+    if not isinstance(card, dict):
+        raise InputError(f"{path} is a damaged checkpoint: its card is no JSON object.")
     version = card.get("format_version")
     if version != FORMAT_VERSION:
         raise InputError(
@@ -209,7 +225,29 @@ def _card(path: Path, text: str | None) -> dict[str, Any]:
     missing = [key for key in REQUIRED if key not in card]
     if missing:
         raise InputError(f"{path} is a damaged checkpoint: it lacks {', '.join(missing)}.")
+    wrong = [key for key, right in _RIGHT.items() if not right(card.get(key))]
+    if wrong:
+        raise InputError(
+            f"{path} is a damaged checkpoint: its {wrong[0]} cannot be {card.get(wrong[0])!r}."
+        )
     return card
+
+
+def _is_number(value: object, least: int, most: int) -> bool:
+    return type(value) is int and least <= value <= most
+
+
+_RIGHT: dict[str, Callable[[Any], bool]] = {
+    "name": lambda value: isinstance(value, str),
+    "backbone": lambda value: isinstance(value, str),
+    "normalisation": lambda value: isinstance(value, dict),
+    "aggregation": lambda value: isinstance(value, dict) and isinstance(value.get("kind"), str),
+    "dim": lambda value: _is_number(value, 1, 2**24),
+    "long_side": lambda value: _is_number(value, 16, 2**14),
+    "rotations": lambda value: _is_number(value, 1, 4),
+    "whitening": lambda value: value is None or _is_number(value, 1, 2**24),
+}
+"""What the values of a card can be."""
 
 
 __all__ = [

@@ -36,7 +36,7 @@ def choose_device(name: str | None = None) -> torch.device:
     if not present.get(device.type, False):
         raise InputError(
             f"Device {name} is not available on this machine (or this PyTorch is built without "
-            f"it): leave `device` out to use the fastest there is."
+            f"it): leave `device` out to use cuda where there is one, else cpu."
         )
     return device
 

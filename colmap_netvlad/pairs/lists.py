@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import codecs
 import csv
 import io
 import json
+import re
 from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 from colmap_netvlad.pairs.union import ImagePair
 from colmap_netvlad.runtime.errors import InputError
 from colmap_netvlad.runtime.files import write_atomically
 
 FORMATS = ("colmap", "csv", "json")
+
+_WORD = re.compile(r'"([^"]+)"(?=\s|$)|(\S+)')
 
 
 def write_pairs(path: Path, pairs: Sequence[ImagePair], format: str = "colmap") -> list[str]:
@@ -31,7 +36,8 @@ def read_pairs(path: Path, names: Collection[str]) -> list[tuple[str, str]]:
     """Read a pairs list in any of our formats (known by its suffix, else COLMAP's).
 
     Pairs twice in either order are taken once; blank lines and lines starting with `#` are
-    skipped as COLMAP does.
+    skipped as COLMAP does. As spreadsheets write them, names may stand between tabs or in double
+    quotes, columns between semicolons, and the text begin with a byte order mark.
 
     Raises:
         InputError: the file is missing or malformed, or names an image not in `names`.
@@ -39,8 +45,10 @@ def read_pairs(path: Path, names: Collection[str]) -> list[tuple[str, str]]:
     if not path.is_file():
         raise InputError(f"The pairs list {path} does not exist; `colmap-netvlad pairs` makes it.")
     try:
-        raw = _READERS.get(path.suffix, _read_colmap)(path.read_text(encoding="utf-8"))
-    except (ValueError, KeyError, TypeError) as fault:
+        raw = _READERS.get(path.suffix.lower(), _read_colmap)(_decoded(path.read_bytes()))
+    except OSError as fault:
+        raise InputError(f"Cannot read {path}: {fault.strerror or fault}.") from fault
+    except (ValueError, csv.Error, RecursionError) as fault:
         raise InputError(f"{path} is not a pairs list: {fault}.") from fault
     known = set(names)
     unknown = sorted({name for pair in raw for name in pair} - known)
@@ -92,7 +100,7 @@ def _read_colmap(text: str) -> list[tuple[str, str]]:
     for number, line in enumerate(text.splitlines(), start=1):
         if not line.strip() or line.lstrip().startswith("#"):
             continue
-        words = line.split()
+        words = [quoted or plain for quoted, plain in _WORD.findall(line)]
         if len(words) != 2:
             raise ValueError(f"line {number} has {len(words)} names, not 2")
         pairs.append((words[0], words[1]))
@@ -100,11 +108,31 @@ def _read_colmap(text: str) -> list[tuple[str, str]]:
 
 
 def _read_csv(text: str) -> list[tuple[str, str]]:
-    return [(row["name1"], row["name2"]) for row in csv.DictReader(io.StringIO(text))]
+    header = text.partition("\n")[0]
+    delimiter = max(",;\t", key=header.count)
+    return _pairs_of(csv.DictReader(io.StringIO(text, newline=""), delimiter=delimiter))
 
 
 def _read_json(text: str) -> list[tuple[str, str]]:
-    return [(row["name1"], row["name2"]) for row in json.loads(text)]
+    return _pairs_of(json.loads(text))
+
+
+def _pairs_of(rows: Any) -> list[tuple[str, str]]:
+    if not isinstance(rows, Iterable):
+        raise ValueError("it is no list")
+    pairs = []
+    for number, row in enumerate(rows, start=1):
+        a, b = (row.get("name1"), row.get("name2")) if isinstance(row, dict) else (None, None)
+        if not (isinstance(a, str) and isinstance(b, str)):
+            raise ValueError(f"row {number} has no texts name1 and name2")
+        pairs.append((a, b))
+    return pairs
+
+
+def _decoded(data: bytes) -> str:
+    """Return a file's text: UTF-8, or UTF-16 where it says so ("Unicode text" of Excel)."""
+    wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    return data.decode("utf-16" if wide else "utf-8-sig")
 
 
 _TEXT = {"colmap": _colmap_text, "csv": _csv_text, "json": _json_text}

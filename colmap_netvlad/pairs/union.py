@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from colmap_netvlad.cache.ranking import NO_PARTNER, Ranking
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class ImagePair:
     """Two images that are to be matched.
 
@@ -29,14 +31,15 @@ def union_of_top(ranking: Ranking, k: int) -> list[ImagePair]:
     Each pair once, no self pairs, in the database's order of its images. Taking every image's
     own list before removing duplicates keeps images late in the database from being starved.
     """
-    best: dict[tuple[int, int], tuple[float, int]] = {}
-    cut = ranking.top(k)
-    for i, (row, scores) in enumerate(zip(cut.partners.tolist(), cut.scores.tolist(), strict=True)):
-        for rank, (j, score) in enumerate(zip(row, scores, strict=True), start=1):
-            if j == NO_PARTNER:
-                break
-            key = (min(i, j), max(i, j))
-            old_score, old_rank = best.get(key, (score, rank))
-            best[key] = (max(score, old_score), min(rank, old_rank))
-    names = ranking.names
-    return [ImagePair(names[i], names[j], *best[i, j]) for i, j in sorted(best)]
+    cut, names = ranking.top(k), ranking.names
+    image, place = np.nonzero(cut.partners != NO_PARTNER)
+    partner = cut.partners[image, place].astype(np.int64)
+    key = np.minimum(image, partner) * len(names) + np.maximum(image, partner)
+    pairs, which = np.unique(key, return_inverse=True)
+    score = np.full(len(pairs), -np.inf, np.float32)
+    np.maximum.at(score, which, cut.scores[image, place])
+    rank = np.full(len(pairs), ranking.depth, np.int64)
+    np.minimum.at(rank, which, place + 1)
+    first, second = (pairs // len(names)).tolist(), (pairs % len(names)).tolist()
+    rows = zip(first, second, score.tolist(), rank.tolist(), strict=True)
+    return [ImagePair(names[i], names[j], high, low) for i, j, high, low in rows]

@@ -5,6 +5,7 @@ Nothing here knows about networks: pixels leave as 8-bit RGB, and a model normal
 
 from __future__ import annotations
 
+import io
 from collections import defaultdict, deque
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -15,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_netvlad.photos.files import BadPhoto, is_jpeg, parse_header, read_bytes
+from colmap_netvlad.photos.files import BadPhoto, is_jpeg, parse_header, photo_path, read_bytes
 from colmap_netvlad.photos.masks import find_mask, neutralise
 from colmap_netvlad.runtime.machine import usable_processors
 
@@ -57,7 +58,7 @@ def decode_photo(path: Path, long_side: int) -> NDArray[np.uint8]:
         BadPhoto: missing, unreadable, truncated, not a photo, or too small.
     """
     data = read_bytes(path)
-    header = parse_header(data)
+    header = parse_header(io.BytesIO(data))
     flags = _reduction(max(header.width, header.height) / long_side) if is_jpeg(data) else None
     try:
         pixels = cv2.imdecode(
@@ -101,7 +102,7 @@ def load_batches(
     """
 
     def decode(name: str) -> NDArray[np.uint8]:
-        pixels = decode_photo(folder / name, long_side)
+        pixels = decode_photo(photo_path(folder, name), long_side)
         mask = find_mask(masks, name) if masks is not None else None
         return pixels if mask is None else neutralise(pixels, mask)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import os
 import struct
 import threading
@@ -11,7 +10,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import BinaryIO
 
 import numpy as np
@@ -39,6 +38,9 @@ XMP_SERIAL_NUMBERS = (
 
 FINGERPRINT_BLOCKS = 8
 FINGERPRINT_BLOCK_BYTES = 16 * 1024
+
+PNG_TAIL_BYTES = 4096
+"""A PNG file's last chunk, IEND, lies within these."""
 
 MOST_PIXELS = 2**30
 """Photos with more pixels than this cannot be decoded: it is OpenCV's limit."""
@@ -73,15 +75,53 @@ class PhotoHeader:
 def find_photos(folder: Path) -> list[str]:
     """Return the sorted names, relative with '/', of the photos in a folder and its subfolders.
 
-    Hidden files and folders (macOS leaves `._DJI_0001.JPG` on memory cards) are passed over.
+    Hidden files and folders (macOS leaves `._DJI_0001.JPG` on memory cards) are passed over, and so
+    are links to a folder that is in there already, or above.
     """
-    names = []
+    root = folder.resolve()
+    names, walked = [], {root}
+
+    def enter(path: Path) -> bool:
+        """Whether to look into a folder: a link back into the photos would find them twice."""
+        real = path.resolve()
+        if path.is_symlink() and (real.is_relative_to(root) or root.is_relative_to(real)):
+            return False
+        if real in walked:
+            return False
+        walked.add(real)
+        return True
+
     for parent, folders, files in os.walk(folder, followlinks=True):
-        folders[:] = [name for name in folders if not name.startswith(".")]
+        here = Path(parent)
+        folders[:] = [n for n in sorted(folders) if not n.startswith(".") and enter(here / n)]
         for name in files:
             if not name.startswith(".") and Path(name).suffix.lower() in PHOTO_SUFFIXES:
-                names.append(Path(parent, name).relative_to(folder).as_posix())
+                names.append((here / name).relative_to(folder).as_posix())
     return sorted(names)
+
+
+def leaves_folder(name: str) -> bool:
+    """Whether an image name is none: empty, absolute, with `..` or NUL, it would lead out of the
+    photo folder."""
+    parts = PurePosixPath(name).parts
+    return (
+        not parts
+        or ".." in parts
+        or "\0" in name
+        or PurePosixPath(name).is_absolute()
+        or (os.name == "nt" and (".." in Path(name).parts or bool(Path(name).anchor)))
+    )
+
+
+def photo_path(folder: Path, name: str) -> Path:
+    """Return where the photo of an image name lies, below `folder` for any name.
+
+    Raises:
+        BadPhoto: the name leads out of the folder.
+    """
+    if leaves_folder(name):
+        raise BadPhoto("has a name that leads out of the photo folder")
+    return folder / name
 
 
 def file_stamp(path: Path) -> str:
@@ -124,12 +164,17 @@ def read_header(path: Path) -> PhotoHeader:
 
     Found: missing, empty and unreadable files, files that are no photo, photos too small, and
     JPEG and PNG files that end early (their last marker is missing). Not found: damage inside
-    a file that has its proper end; COLMAP reads such photos, too.
+    a file that has its proper end; COLMAP reads such photos, too. Head and tail are read; a JPEG
+    file with something behind its end marker is read whole.
 
     Raises:
         BadPhoto: one of these.
     """
-    return parse_header(read_bytes(path))
+    try:
+        with path.open("rb") as file:
+            return parse_header(file)
+    except OSError as fault:
+        raise BadPhoto(_file_fault(fault)) from fault
 
 
 def read_bytes(path: Path) -> bytes:
@@ -145,11 +190,18 @@ def _file_fault(fault: OSError) -> str:
     return f"cannot be read ({fault.strerror or fault})"
 
 
-def parse_header(data: bytes) -> PhotoHeader:
-    if not data:
+def parse_header(file: BinaryIO) -> PhotoHeader:
+    """Check an open photo as `read_header` does.
+
+    Raises:
+        BadPhoto: it cannot be used.
+        OSError: it cannot be read.
+    """
+    start = file.read(4)
+    if not start:
         raise BadPhoto("is empty")
     try:
-        with open_header(io.BytesIO(data)) as photo:
+        with open_header(file) as photo:
             header = PhotoHeader(
                 photo.width, photo.height, _lens(photo), _serial(photo), _day(photo)
             )
@@ -157,15 +209,21 @@ def parse_header(data: bytes) -> PhotoHeader:
         raise BadPhoto("is not a photo") from fault
     except (OSError, SyntaxError, ValueError) as fault:
         raise BadPhoto(f"has a damaged header ({fault})") from fault
-    if is_jpeg(data) and not _jpeg_is_whole(data):
+    if is_jpeg(start) and not _jpeg_is_whole(file):
         raise BadPhoto("is truncated (the JPEG data end early)")
-    if data.startswith(b"\x89PNG") and data.rfind(b"IEND", -4096) < 0:
+    if start == b"\x89PNG" and b"IEND" not in _tail(file, PNG_TAIL_BYTES):
         raise BadPhoto("is truncated (the PNG data end early)")
     if header.width * header.height > MOST_PIXELS:
         raise BadPhoto(f"has {header.width} x {header.height} pixels, more than can be decoded")
     if min(header.width, header.height) < MIN_SIDE:
         raise BadPhoto(f"is only {header.width} x {header.height} pixels")
     return header
+
+
+def _tail(file: BinaryIO, count: int) -> bytes:
+    size = file.seek(0, os.SEEK_END)
+    file.seek(max(size - count, 0))
+    return file.read(count)
 
 
 @contextmanager
@@ -192,14 +250,15 @@ def is_jpeg(data: bytes) -> bool:
     return data.startswith(b"\xff\xd8")
 
 
-def _jpeg_is_whole(data: bytes) -> bool:
+def _jpeg_is_whole(file: BinaryIO) -> bool:
     """Whether the picture's end marker follows its scan; an embedded thumbnail's does not count.
 
     Decoders fill the missing part of a truncated picture with grey, mostly silently.
     """
-    if data.endswith(b"\xff\xd9"):
+    if _tail(file, 2) == b"\xff\xd9":
         return True
-    at = 2
+    file.seek(0)
+    data, at = file.read(), 2
     while at + 4 <= len(data) and data[at] == 0xFF:
         if data[at + 1] == 0xDA:
             # Inside a scan a byte 0xFF is never followed by 0xD9, so the first is the end.

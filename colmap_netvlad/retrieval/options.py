@@ -49,7 +49,7 @@ class RetrievalOptions:
     Attributes:
         k: partners of each image, at least 1; some methods rank deeper.
         model: a checkpoint to use instead of the named method.
-        device: where networks run; None takes the fastest there is.
+        device: where networks run; None: cuda where there is one, else cpu.
         seed: of every random choice.
         batch_size: photos described at once; None: the method's own.
         vocab_tree: the vocabulary tree of `bow`; None: see `bow.find_tree`.

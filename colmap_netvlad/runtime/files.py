@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import glob
 import os
+import re
+import shutil
+import socket
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from colmap_netvlad.runtime.errors import InputError
@@ -22,7 +26,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+        handle, name = tempfile.mkstemp(prefix=temporary_prefix(path), dir=path.parent)
         os.close(handle)
     except OSError as fault:
         raise InputError(f"Cannot write {path}: {fault.strerror or fault}.") from fault
@@ -46,6 +50,56 @@ def write_atomically(path: Path, content: str | bytes) -> None:
     data = content.encode("utf-8") if isinstance(content, str) else content
     with atomic_path(path) as temporary:
         temporary.write_bytes(data)
+
+
+def temporary_prefix(path: Path) -> str:
+    """Return how the name of a temporary file or folder beside `path` begins.
+
+    It says which process of which machine made it. What processes that are gone (killed: nobody
+    tidied up after them) have left of the same `path` is removed.
+    """
+    machine = re.sub(r"\W", "-", socket.gethostname())
+    for left in path.parent.glob(f".{glob.escape(path.name)}.{machine}-*"):
+        maker = re.match(r"(\d+)-", left.name.removeprefix(f".{path.name}.{machine}-"))
+        if maker is not None and not _runs(int(maker[1])):
+            if left.is_dir():
+                shutil.rmtree(left, ignore_errors=True)
+            else:
+                with suppress(OSError):
+                    left.unlink()
+    return f".{path.name}.{machine}-{os.getpid()}-"
+
+
+@contextmanager
+def scratch_folder() -> Iterator[Path]:
+    """Yield an empty folder on the system's temporary disk, which is gone after the block.
+
+    Those of processes that were killed go with the next one.
+
+    Raises:
+        InputError: the temporary disk cannot be written.
+    """
+    base = Path(tempfile.gettempdir()) / "colmap-netvlad"
+    try:
+        folder = tempfile.mkdtemp(prefix=temporary_prefix(base), dir=base.parent)
+    except OSError as fault:
+        raise InputError(f"Cannot write in {base.parent}: {fault.strerror or fault}.") from fault
+    try:
+        yield Path(folder)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _runs(process: int) -> bool:
+    if os.name == "nt":
+        return True  # os.kill would end it there: what it left stays
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:
+        return True
+    return True
 
 
 def _umask() -> int:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,6 +12,7 @@ from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval.options import RetrievalOptions
 from colmap_netvlad.retrieval.rank import rank
 from colmap_netvlad.runtime.errors import InputError
+from colmap_netvlad.runtime.files import scratch_folder
 from colmap_netvlad.training.scenes import Scene
 from colmap_netvlad.training.validate import Score, mean_score, score
 
@@ -63,8 +63,8 @@ def evaluate(
     scores: dict[str, dict[str, Score]] = {method: {} for method in methods}
     seconds = dict.fromkeys(methods, 0.0)
     for scene in scenes:
-        with tempfile.TemporaryDirectory(prefix="colmap-netvlad-") as folder:
-            database = Path(folder) / "project.db"
+        with scratch_folder() as folder:
+            database = folder / "project.db"
             copy_database(databases / f"{scene.name}.db", database, matches=False)
             full = replace(options or RetrievalOptions(), k=len(scene) - 1)
             with open_flight(Project(database, scene.images)) as flight:

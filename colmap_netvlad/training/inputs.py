@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from colmap_netvlad.photos.decode import SIDE_MULTIPLE, decode_photo
-from colmap_netvlad.photos.files import BadPhoto
+from colmap_netvlad.photos.files import BadPhoto, photo_path
 from colmap_netvlad.runtime.errors import InputError
 from colmap_netvlad.runtime.progress import step
 from colmap_netvlad.training.augment import View, draw_view, render
@@ -89,7 +89,7 @@ class Photos:
                 self._kept.move_to_end((path, side))
                 return self._kept[path, side]
         try:
-            pixels = decode_photo(path, side)
+            pixels = decode_photo(photo_path(one.images, one.names[image]), side)
         except BadPhoto as fault:
             raise InputError(
                 f"The photo {path} of scene {one.name} {fault}; mend it, or take it out and "
@@ -127,7 +127,7 @@ class Photos:
         """Return a photo, or a pseudo-scene's cut of it, upright and whole: (H, W, 3)."""
         one = self.scenes[scene]
         if one.crops is None:
-            return decode_photo(one.images / one.names[image], long_side)
+            return decode_photo(photo_path(one.images, one.names[image]), long_side)
         photo = self.photo(scene, image)
         size = decoded_size(photo.shape[1::-1], long_side)
         return render(photo, View(np.eye(3)), size, self._crop(scene, image))

@@ -94,7 +94,7 @@ def train(
         validation: annotated scenes that are never trained on; without them the last epoch is
             the best.
         output: the run's folder.
-        device: cpu, cuda, ...; None takes the fastest there is. On CUDA in mixed precision.
+        device: cpu, cuda, ...; None: cuda where there is one, else cpu. On CUDA in mixed precision.
         name: what the model calls itself; default: the folder's name.
         metadata: more for the model's card (command, commit, licence).
         cache: folder of frozen features, which runs on the same photos may share; default:

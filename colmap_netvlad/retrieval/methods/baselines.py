@@ -10,8 +10,9 @@ from colmap_netvlad.graph.pair import places_by_name
 from colmap_netvlad.retrieval.options import RetrievalOptions
 from colmap_netvlad.runtime.errors import InputError
 
-MOST_EXHAUSTIVE = 10_000
-"""Above this many images all pairs (50 million) are beyond any matching."""
+MOST_EXHAUSTIVE = 2_000
+"""Two million pairs, days of matching: above this many images nobody waits for all of them, and
+their list alone would take gigabytes of memory."""
 
 
 def exhaustive(flight: Flight, options: RetrievalOptions, depth: int) -> Ranking:
@@ -23,8 +24,8 @@ def exhaustive(flight: Flight, options: RetrievalOptions, depth: int) -> Ranking
     count = len(flight.images)
     if count > MOST_EXHAUSTIVE:
         raise InputError(
-            f"{count} images make {count * (count - 1) // 2:,} pairs; exhaustive serves up to "
-            f"{MOST_EXHAUSTIVE:,} images."
+            f"{count:,} images make {count * (count - 1) // 2:,} pairs, more than can be matched "
+            f"in days; exhaustive serves up to {MOST_EXHAUSTIVE:,} images: take another `method`."
         )
     others = max(count - 1, 0)
     partners = np.tile(np.arange(others, dtype=np.int32), (count, 1))

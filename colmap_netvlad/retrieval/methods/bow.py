@@ -8,10 +8,10 @@ where COLMAP has cached it; one built from the project's own descriptors, kept b
 from __future__ import annotations
 
 import hashlib
-import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,9 +21,9 @@ from colmap_netvlad.colmap.copies import copy_database
 from colmap_netvlad.flight import Flight
 from colmap_netvlad.retrieval.methods.vlad import NO_FEATURES, sample_descriptors
 from colmap_netvlad.retrieval.options import RetrievalOptions
-from colmap_netvlad.runtime import progress
+from colmap_netvlad.runtime import progress, workers
 from colmap_netvlad.runtime.errors import InputError
-from colmap_netvlad.runtime.files import atomic_path
+from colmap_netvlad.runtime.files import atomic_path, scratch_folder
 
 PUBLISHED = "vocab_tree_faiss_flickr100K_words256K.bin"
 PUBLISHED_SHA256 = "96ca8ec8ea60b1f73465aaf2c401fd3b3ca75cdba2d3c50d6a2f6f760f275ddc"
@@ -62,10 +62,14 @@ def candidates(flight: Flight, options: RetrievalOptions, depth: int) -> Ranking
     tree, note = find_tree(flight, options.vocab_tree, options.seed)
     rows = {image.image_id: i for i, image in enumerate(images)}
     depth = len(images) - 1 if len(images) <= FULL_DEPTH else max(depth, LEAST_DEPTH)
-    with tempfile.TemporaryDirectory(prefix="colmap-netvlad-") as folder:
-        features = Path(folder) / "features.db"
+    with scratch_folder() as folder:
+        features = folder / "features.db"
         copy_database(flight.project.database, features, matches=False)
-        partners, seconds_index, seconds_query = _query(features, tree, rows, described, depth)
+        answer = folder / "answer.npz"
+        arguments = answer, features, tree, rows, frozenset(described), depth
+        _apart("Asking the vocabulary tree", len(rows), _query, *arguments)
+        with np.load(answer, allow_pickle=False) as kept:
+            partners, (seconds_index, seconds_query) = kept["partners"], kept["seconds"].tolist()
     scores = 1 / np.arange(1, depth + 1, dtype=np.float32)
     return Ranking(
         flight.names,
@@ -112,16 +116,18 @@ def _own_tree(flight: Flight, seed: int) -> tuple[Path, str]:
     start = time.perf_counter()
     for old in tree.parent.glob(cache.with_suffix(".words-*.bin").name):
         old.unlink()
-    _build(tree, sample.astype(np.float32), words, seed)
+    with atomic_path(tree) as temporary:
+        title = f"Building a vocabulary tree of {words} words"
+        _apart(title, 1, _build, temporary, sample, words, seed)
     return tree, f"{note}, in {time.perf_counter() - start:.0f} s"
 
 
-def _build(tree: Path, sample: NDArray[np.float32], words: int, seed: int) -> None:
+def _build(
+    advance: Callable[[int], None], tree: Path, sample: NDArray[np.uint8], words: int, seed: int
+) -> None:
+    """Build a tree (in a worker)."""
     import pycolmap
 
-    from colmap_netvlad.colmap.engine import silence
-
-    silence()
     pycolmap.set_random_seed(seed)
     index = pycolmap.VisualIndex.create(sample.shape[1], EMBEDDING)
     options = pycolmap.VisualIndex.BuildOptions()
@@ -129,25 +135,29 @@ def _build(tree: Path, sample: NDArray[np.float32], words: int, seed: int) -> No
     options.num_iterations = BUILD_ITERATIONS
     options.num_rounds = 1
     options.num_threads = 1  # with several, faiss's k-means now and then gives another tree
-    with progress.step(f"Building a vocabulary tree of {words} words", 1) as bar:
-        index.build(
-            options,
-            pycolmap.FeatureDescriptorsFloat(pycolmap.FeatureExtractorType.SIFT, sample),
-        )
-        bar.advance()
-    with atomic_path(tree) as temporary:
-        index.write(temporary)
+    values = sample.astype(np.float32)
+    index.build(
+        options, pycolmap.FeatureDescriptorsFloat(pycolmap.FeatureExtractorType.SIFT, values)
+    )
+    index.write(tree)
+    advance(1)
 
 
 def _query(
-    features: Path, tree: Path, rows: dict[int, int], described: Mapping[int, int], depth: int
-) -> tuple[NDArray[np.int32], float, float]:
-    """Index all images and query each; return partners (N, depth) and the seconds of both."""
+    advance: Callable[[int], None],
+    answer: Path,
+    features: Path,
+    tree: Path,
+    rows: Mapping[int, int],
+    described: Collection[int],
+    depth: int,
+) -> None:
+    """Index all images and query each (in a worker).
+
+    Writes partners (N, depth), and the seconds of both, to `answer`.
+    """
     import pycolmap
 
-    from colmap_netvlad.colmap.engine import silence
-
-    silence()
     partners = np.full((len(rows), depth), NO_PARTNER, np.int32)
     database = pycolmap.Database.open(features)
     try:
@@ -158,23 +168,36 @@ def _query(
         # run, from the first partner on.
         options.num_threads = 1
         start = time.perf_counter()
-        with progress.step("Indexing with the vocabulary tree", 1) as bar:
-            generator = pycolmap.VocabTreePairGenerator(options, database)
-            bar.advance()
+        generator = pycolmap.VocabTreePairGenerator(options, database)
         indexed = time.perf_counter()
-        with progress.step("Querying the vocabulary tree", len(rows)) as bar:
-            while not generator.has_finished():
-                _keep(generator.next(), rows, described, partners)
-                bar.advance()
+        while not generator.has_finished():
+            _keep(generator.next(), rows, described, partners)
+            advance(1)
     finally:
         database.close()
-    return partners, indexed - start, time.perf_counter() - indexed
+    seconds = indexed - start, time.perf_counter() - indexed
+    np.savez(answer, partners=partners, seconds=seconds)
+
+
+def _apart(title: str, total: int, function: Callable[..., None], *arguments: Any) -> None:
+    """Run a job in a process of its own: COLMAP's trees cannot be interrupted, a process can.
+
+    Raises:
+        InputError: it failed.
+    """
+    from colmap_netvlad.colmap import engine
+
+    with progress.step(title, total) as bar:
+        job = workers.Job(function, arguments)
+        (outcome,) = workers.run([job], 1, bar.advance, initialiser=engine.initialiser())
+    if outcome.fault is not None:
+        raise InputError(f"{title} failed: {outcome.fault}.")
 
 
 def _keep(
     pairs: list[tuple[int, int]],
-    rows: dict[int, int],
-    described: Mapping[int, int],
+    rows: Mapping[int, int],
+    described: Collection[int],
     partners: NDArray[np.int32],
 ) -> None:
     """Write one query's answer, (query, partner) best first, into its row."""
@@ -187,9 +210,9 @@ def _keep(
 def _check_tree(tree: Path) -> None:
     import pycolmap
 
-    from colmap_netvlad.colmap.engine import silence
+    from colmap_netvlad.colmap import engine
 
-    silence()
+    engine.silence()
     if not tree.is_file():
         raise InputError(f"The vocabulary tree {tree} does not exist.")
     try:

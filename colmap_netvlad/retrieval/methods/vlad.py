@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from colmap_netvlad.cache.ranking import Ranking
 from colmap_netvlad.cache.store import Store
-from colmap_netvlad.colmap.database import Database
+from colmap_netvlad.colmap.database import SIFT_BYTES, Database
 from colmap_netvlad.flight import Flight
 from colmap_netvlad.retrieval.described import cache_note, missing, rank_described
 from colmap_netvlad.retrieval.options import RetrievalOptions
@@ -126,7 +126,8 @@ def _codebook(
     they were learned now."""
     key = f"vlad-{WORDS}-seed-{seed}"
     kept = store.codebook(key)
-    if kept is not None and kept[1] <= len(image_ids) <= OUTGROWN * kept[1]:
+    fits = kept is not None and kept[0].shape[1] == SIFT_BYTES
+    if kept is not None and fits and kept[1] <= len(image_ids) <= OUTGROWN * kept[1]:
         return kept[0], False
     words = learn_words(database, image_ids, seed)
     store.keep_codebook(key, words, len(image_ids))

@@ -1,0 +1,326 @@
+"""Kill commands at random moments, run them again, and compare with an undisturbed run.
+
+    python tests/soak/kill.py match --times 100 --seed 0
+
+Each try starts the command on a small rendered flight, sends SIGKILL at a random moment (to the
+command, or to it and its workers), once to three times, then lets it run to its end. Wanted are
+the same images, features, matches, pairs, figures and weights as of a run that nobody disturbed, a
+database that sqlite and COLMAP find whole after each kill, and no file left behind.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import os
+import shutil
+import signal
+import sqlite3
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from contextlib import closing, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from colmap_netvlad.cli import cli
+
+LONGEST = 600.0
+"""A run that takes longer than this hangs, s."""
+
+TIMES = ("seconds", "created", "time", "ms_", "timed", "measured", "memory", "database")
+"""Words in the names of figures that differ between two undisturbed runs."""
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A command under test.
+
+    Attributes:
+        words: its words, where {} stands for the project's folder.
+        sound: prepares the folder that it starts from.
+    """
+
+    words: tuple[str, ...]
+    sound: Callable[[Path], None]
+
+
+def photos(folder: Path) -> None:
+    """Eight rendered photos."""
+    from colmap_netvlad.demo.render import FlightOptions, render_flight
+
+    options = FlightOptions(rows=2, columns=4, width=400, height=300, altitude=45.0)
+    render_flight(folder / "flight", options)
+    (folder / "flight" / "images").rename(folder / "images")
+    shutil.rmtree(folder / "flight")
+
+
+def features(folder: Path) -> None:
+    """The same with features."""
+    photos(folder)
+    run(folder, "features", "--images", "{}/images", "--db", "{}/project.db", *FEW)
+
+
+def listed(folder: Path) -> None:
+    """The same with a list of all pairs."""
+    features(folder)
+    names = sorted(path.name for path in (folder / "images").iterdir())
+    pairs = [f"{a} {b}\n" for a in names for b in names if a < b]
+    (folder / "pairs.txt").write_text("".join(pairs))
+
+
+def matched(folder: Path) -> None:
+    """The same, matched."""
+    listed(folder)
+    run(folder, "match", "--db", "{}/project.db")
+
+
+def built(folder: Path) -> None:
+    """A model of seven photos, and an eighth that is to join."""
+    photos(folder)
+    last = max((folder / "images").iterdir())
+    last.rename(folder / "new.jpg")
+    run(folder, "features", "--images", "{}/images", "--db", "{}/project.db", *FEW)
+    run(folder, "pairs", "--db", "{}/project.db", "--method", "exhaustive")
+    run(folder, "reconstruct", "--db", "{}/project.db", *ONE)
+    (folder / "new.jpg").rename(last)
+
+
+def annotated(folder: Path) -> None:
+    """Two annotated scenes and weights to begin from."""
+    import torch
+    from safetensors.torch import save_file
+
+    from colmap_netvlad.models.backbones import build_trunk
+
+    for scene in ("first", "second"):
+        (folder / scene).mkdir()
+        features(folder / scene)
+    run(folder, "annotate", "{}/first", "{}/second", "--output", "{}/scenes",
+        "--method", "exhaustive")  # fmt: skip
+    torch.manual_seed(0)
+    save_file(build_trunk("efficientnet-lite0-stage5").state_dict(), folder / "lite.safetensors")
+
+
+FEW = ("--max-features", "800", "--threads", "1")
+ONE = ("--mapper", "incremental", "--threads", "1")
+DB = ("--db", "{}/project.db")
+
+KINDS = {
+    "features": Kind(("features", "--images", "{}/images", *DB, *FEW), photos),
+    "pairs": Kind(("pairs", *DB, "--method", "hybrid", "--k", "3"), features),
+    "pairs-bow": Kind(("pairs", *DB, "--method", "bow", "--k", "3"), features),
+    "match": Kind(("match", *DB), listed),
+    "match-rounds": Kind(("match", *DB, "--rounds", "2", "--k", "2", "--method", "vlad"), features),
+    "reconstruct": Kind(("reconstruct", *DB, *ONE), matched),
+    "reconstruct-parallel": Kind(
+        ("reconstruct", *DB, "--mapper", "parallel", "--cluster-size", "4", "--threads", "1"),
+        matched,
+    ),
+    "add": Kind(("add", *DB, "--images", "{}/images", "--method", "vlad", "--k", "5"), built),
+    "compare": Kind(
+        ("compare", *DB, "--methods", "vlad,random", "--k", "2,3", "--no-reconstruct"), features
+    ),
+    "train": Kind(
+        ("train", "{}/scenes", "--output", "{}/run", "--trunk", "efficientnet-lite0-stage5",
+         "--weights", "{}/lite.safetensors", "--clusters", "4", "--width", "96", "--height", "64",
+         "--positives", "2", "--epsilon", "10", "--epochs", "2", "--iterations", "3",
+         "--checkpoint-every", "1", "--long-side", "96", "--rotations", "1"),
+        annotated,
+    ),
+}  # fmt: skip
+
+
+# Running
+
+
+def start(folder: Path, *words: str) -> int:
+    """Start a command in a process of its own and return its id."""
+    process = os.fork()
+    with suppress(OSError):  # whoever of the two is first
+        os.setpgid(process, process)
+    if process:
+        return process
+    log = os.open(folder.parent / "log.txt", os.O_CREAT | os.O_WRONLY | os.O_TRUNC)
+    os.dup2(log, 1)
+    os.dup2(log, 2)
+    os.environ["TMPDIR"] = str(scratch_of(folder))
+    tempfile.tempdir = None
+    sys.argv[0] = "colmap-netvlad"
+    code = 1
+    try:
+        cli([word.replace("{}", str(folder)) for word in words])
+    except SystemExit as end:
+        code = end.code if isinstance(end.code, int) else 1
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+
+
+def scratch_of(folder: Path) -> Path:
+    """The temporary disk of a project's commands."""
+    scratch = folder.parent / "scratch"
+    scratch.mkdir(exist_ok=True)
+    return scratch
+
+
+def run(folder: Path, *words: str) -> float:
+    """Run a command to its end and return how long it took, s."""
+    began = time.monotonic()
+    process = start(folder, *words)
+    while time.monotonic() - began < LONGEST:
+        done, status = os.waitpid(process, os.WNOHANG)
+        if done:
+            if os.waitstatus_to_exitcode(status) != 0:
+                raise RuntimeError(f"{words}: {(folder.parent / 'log.txt').read_text()}")
+            return time.monotonic() - began
+        time.sleep(0.01)
+    os.killpg(process, signal.SIGKILL)
+    raise RuntimeError(f"{words} hangs")
+
+
+def killed(folder: Path, words: tuple[str, ...], after: float, group: bool) -> bool:
+    """Start a command and kill it after some seconds; whether it was still running."""
+    process = start(folder, *words)
+    deadline = time.monotonic() + after
+    while time.monotonic() < deadline:
+        done, _ = os.waitpid(process, os.WNOHANG)
+        if done:
+            return False
+        time.sleep(0.002)
+    (os.killpg if group else os.kill)(process, signal.SIGKILL)
+    os.waitpid(process, 0)
+    return True
+
+
+# Comparing
+
+
+def state(folder: Path) -> dict[str, Any]:
+    """Return what a command has made, without times."""
+    found: dict[str, Any] = {}
+    for path in sorted(folder.rglob("*")):
+        name = path.relative_to(folder).as_posix()
+        if path.suffix == ".db" and path.name != "seconds.db":
+            found[name] = _tables(path)
+        elif path.name == "pairs.txt" or path.suffix == ".safetensors":
+            found[name] = hashlib.sha256(path.read_bytes()).hexdigest()
+        elif path.name == "points3D.bin":
+            found[name] = _figures(path.parent)
+        elif path.name == "compare.json":
+            found[name] = _timeless(json.loads(path.read_text()))
+        elif path.is_file():
+            found[name] = "there"
+    return found
+
+
+def _tables(path: Path) -> dict[str, Any]:
+    with closing(sqlite3.connect(path)) as connection:
+        names = connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'").fetchall()
+        found = {}
+        for (name,) in names:
+            if name in ("photos", "sqlite_sequence", "settings"):
+                continue
+            columns = [row[1] for row in connection.execute(f"PRAGMA table_info({name})")]
+            kept = ", ".join(column for column in columns if column != "seconds")
+            rows = connection.execute(f"SELECT {kept} FROM {name} ORDER BY 1, 2").fetchall()
+            found[name] = (len(rows), hashlib.sha256(repr(rows).encode()).hexdigest())
+        return found
+
+
+def _figures(model: Path) -> tuple[int, int, float]:
+    import pycolmap
+
+    read = pycolmap.Reconstruction(model)
+    error = round(read.compute_mean_reprojection_error(), 6)
+    return read.num_reg_images(), read.num_points3D(), error
+
+
+def _timeless(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {
+            key: _timeless(item)
+            for key, item in value.items()
+            if not any(word in key for word in TIMES) and key != "notes"
+        }
+    return [_timeless(item) for item in value] if isinstance(value, list) else value
+
+
+def check_whole(folder: Path) -> None:
+    """Make sure that sqlite finds every database whole."""
+    for path in folder.rglob("*.db"):
+        with closing(sqlite3.connect(path)) as connection:
+            (said,) = connection.execute("PRAGMA integrity_check").fetchone()
+            if said != "ok":
+                raise RuntimeError(f"{path}: {said}")
+
+
+def left_behind(folder: Path) -> list[str]:
+    """Return the temporary files that are still there."""
+    hidden = [path for path in folder.rglob("*") if path.name.startswith(".")]
+    parts = [path for path in folder.rglob("*") if path.suffix in (".tmp", ".part")]
+    return [str(path) for path in (*hidden, *parts, *scratch_of(folder).iterdir())]
+
+
+def differences(one: dict[str, Any], other: dict[str, Any]) -> list[str]:
+    """Return what two states differ in."""
+    return [
+        f"{key}: {one.get(key)} instead of {other.get(key)}"
+        for key in sorted({*one, *other})
+        if one.get(key) != other.get(key)
+    ]
+
+
+def main() -> int:
+    """Kill a command many times and print what went wrong; 1 where anything did."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("command", choices=KINDS)
+    parser.add_argument("--times", type=int, default=100)
+    parser.add_argument("--seed", type=int, default=0)
+    chosen = parser.parse_args()
+    kind, random = KINDS[chosen.command], np.random.default_rng(chosen.seed)
+    kills = faults = 0
+    with tempfile.TemporaryDirectory(prefix="kill-") as top:
+        base = Path(top, "base", "project")
+        base.mkdir(parents=True)
+        kind.sound(base)
+        for number in range(-1, chosen.times):
+            folder = Path(top, f"try{number}", "project")
+            shutil.copytree(base, folder)
+            wrong: list[str] = []
+            try:
+                if number < 0:
+                    seconds = run(folder, *kind.words)
+                    whole = state(folder)
+                    wrong = left_behind(folder)
+                else:
+                    for _ in range(random.integers(1, 4)):
+                        after = float(random.uniform(0, 1.1 * seconds))
+                        kills += killed(folder, kind.words, after, bool(random.integers(2)))
+                        check_whole(folder)
+                    run(folder, *kind.words)
+                    wrong = differences(state(folder), whole) + left_behind(folder)
+            except (RuntimeError, sqlite3.Error) as fault:
+                wrong = [str(fault)]
+            if wrong:
+                faults += 1
+                print(f"{chosen.command} {number} (--seed {chosen.seed}):", *wrong, sep="\n  ")
+            shutil.rmtree(folder.parent)
+    print(
+        f"{chosen.command}: {chosen.times} tries, {kills} kills, {faults} with faults", flush=True
+    )
+    return 1 if faults else 0
+
+
+if __name__ == "__main__":
+    # Loaded once, before the processes part.
+    import pycolmap  # noqa: F401
+    import torch  # noqa: F401
+
+    sys.exit(main())
