@@ -14,7 +14,6 @@ from collections.abc import Iterable
 from itertools import combinations
 from pathlib import Path
 
-import cv2
 import numpy as np
 from matplotlib import image as photos
 from matplotlib.axes import Axes
@@ -40,7 +39,7 @@ from colmap_netvlad.retrieval.fusion import similarity_matrix
 from colmap_netvlad.retrieval.methods import deep
 from colmap_netvlad.retrieval.options import RetrievalOptions
 from colmap_netvlad.retrieval.rank import rank_project
-from colmap_netvlad.retrieval.rerank import TOLERANCE, TRANSFORMS, Places, agreeing_matches
+from colmap_netvlad.retrieval.rerank import Places, agreeing_matches, agreement
 
 FIGURES = Path(__file__).parents[1] / "docs" / "figures"
 
@@ -82,25 +81,6 @@ def places_of(project: Project, names: Iterable[str]) -> dict[str, tuple[Places,
             cells = store.read_cells(numbers[name])
             found[name] = Places.of(cells), *cells.codes.shape[:2]
     return found
-
-
-def agreement(one: Places, other: Places) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """Return (M, 2) mutual nearest neighbours and (M,) which agree: `agreeing_matches`, shown."""
-    cosines = one.vectors @ other.vectors.T
-    best, back = cosines.argmax(axis=1), cosines.argmax(axis=0)
-    mutual = np.flatnonzero(back[best] == np.arange(len(best)))
-    _, agree = cv2.estimateAffinePartial2D(
-        one.at[mutual],
-        other.at[best[mutual]],
-        method=cv2.RANSAC,
-        ransacReprojThreshold=TOLERANCE,
-        maxIters=TRANSFORMS,
-        refineIters=0,
-    )
-    agree = agree.ravel().astype(bool)
-    if agree.sum() != agreeing_matches(one, other):
-        raise AssertionError("this drawing is not what the program counts")
-    return np.stack([mutual, best[mutual]], axis=1), agree
 
 
 def draw_places(flight: RenderedFlight, project: Project) -> Figure:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -43,38 +44,39 @@ def map_automatic(
     return mapper(database, images, output, options)
 
 
-def run_hierarchical(
-    advance: Callable[[int], None],
-    database: Path,
-    images: Path | None,
-    folder: Path,
-    options: MappingOptions,
-) -> None:
+@dataclass(frozen=True)
+class _Request:
+    """What a mapper in a worker is to map; `images` None leaves points black."""
+
+    database: Path
+    images: Path | None
+    options: MappingOptions
+
+
+def run_hierarchical(advance: Callable[[int], None], request: _Request, folder: Path) -> None:
     """Run COLMAP's hierarchical mapper (in a worker) and write models `folder`/0, 1, ..."""
+    options, images = request.options, request.images
     size = options.cluster_size or CLUSTER_IMAGES
     pipeline = pycolmap.HierarchicalPipelineOptions()
     pipeline.incremental_options = pipeline_options(options, colors=images is not None)
     pipeline.clustering_options.leaf_max_num_images = size
     pipeline.clustering_options.image_overlap = max(3, math.ceil(OVERLAP_SHARE * size))
     pipeline.num_threads = options.threads or usable_processors()
-    models = pycolmap.hierarchical_mapping(database, images or folder, folder, options=pipeline)
-    _write(models, folder)
+    _write(
+        pycolmap.hierarchical_mapping(request.database, images or folder, folder, options=pipeline),
+        folder,
+    )
 
 
-def run_global(
-    advance: Callable[[int], None],
-    database: Path,
-    images: Path | None,
-    folder: Path,
-    options: MappingOptions,
-) -> None:
+def run_global(advance: Callable[[int], None], request: _Request, folder: Path) -> None:
     """Run COLMAP's global mapper (in a worker) and write models `folder`/0, 1, ..."""
+    options = request.options
     pipeline = pycolmap.GlobalPipelineOptions()
     pipeline.random_seed = options.seed
     pipeline.min_model_size = options.min_model_size
     pipeline.num_threads = options.threads or usable_processors()
-    models = pycolmap.global_mapping(database, images or folder, folder, options=pipeline)
-    _write(models, folder)
+    images = request.images or folder
+    _write(pycolmap.global_mapping(request.database, images, folder, options=pipeline), folder)
 
 
 def _map(
@@ -88,7 +90,7 @@ def _map(
     """Run a mapper that cannot be cancelled in a worker, which Ctrl-C ends."""
     with model_folder(output) as folder:
         logger.info("Mapping %s; COLMAP tells no progress of this mapper.", how)
-        job = workers.Job(function, (database, images, folder, options))
+        job = workers.Job(function, (_Request(database, images, options), folder))
         (outcome,) = workers.run([job], 1, lambda count: None, initialiser=engine.initialiser())
         if outcome.fault is not None:
             raise InputError(f"COLMAP could not map {how}: {outcome.fault}.")

@@ -114,13 +114,20 @@ class Places:
 
 def agreeing_matches(one: Places, other: Places) -> int:
     """Return how many mutual nearest neighbours agree on one similarity transform."""
+    return int(agreement(one, other)[1].sum())
+
+
+def agreement(one: Places, other: Places) -> tuple[Pairs, NDArray[np.bool_]]:
+    """Return (M, 2) mutual nearest neighbours, places of both, and (M,) which of them agree on
+    one similarity transform."""
+    nothing = np.zeros((0, 2), np.intp), np.zeros(0, np.bool_)
     if min(len(one.at), len(other.at)) < 2:
-        return 0
+        return nothing
     cosines = one.vectors @ other.vectors.T
     best, back = cosines.argmax(axis=1), cosines.argmax(axis=0)
     mutual = np.flatnonzero(back[best] == np.arange(len(best)))
     if len(mutual) < 2:
-        return 0
+        return nothing
     # OpenCV seeds each call alike: the same count every time.
     _, agree = cv2.estimateAffinePartial2D(
         one.at[mutual],
@@ -130,7 +137,8 @@ def agreeing_matches(one: Places, other: Places) -> int:
         maxIters=TRANSFORMS,
         refineIters=0,
     )
-    return 0 if agree is None else int(agree.sum())
+    pairs = np.stack([mutual, best[mutual]], axis=1)
+    return pairs, np.zeros(len(pairs), np.bool_) if agree is None else agree.ravel() > 0
 
 
 def _pairs_of(similarity: sparse.csr_array) -> Pairs:
