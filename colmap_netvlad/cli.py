@@ -49,9 +49,12 @@ from colmap_netvlad.runtime.version import VERSION
 from colmap_netvlad.terminal import Group, say
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from colmap_netvlad.colmap.features import FeatureOptions
     from colmap_netvlad.commands.georegister import ControlFile, WorldOptions
     from colmap_netvlad.commands.match import RoundsOptions
+    from colmap_netvlad.commands.report import FlightReport
     from colmap_netvlad.mapping.options import MappingOptions
     from colmap_netvlad.matching.run import MatchOptions
     from colmap_netvlad.project import Project
@@ -257,6 +260,11 @@ def match(
     " where there are models already]",
 )
 @mapping_options
+@click.option(
+    "--drop-contradicted",
+    is_flag=True,
+    help="Leave out pairs of look-alike places: what the pairs around them or GPS contradict.",
+)
 @place_options
 @ground_options
 @matching_options
@@ -267,6 +275,7 @@ def reconstruct(
     output: Path | None,
     mapper: str,
     mapping: MappingOptions,
+    drop_contradicted: bool,
     world: WorldOptions,
     gcp: ControlFile | None,
     pairs: Path | None,
@@ -286,8 +295,9 @@ def reconstruct(
     from colmap_netvlad.terminal import print_models
 
     check_mapper(mapper, use_gps=world.use_gps)
+    mapping = replace(mapping, seed=matching.seed)
     options = ReconstructOptions(
-        mapper, replace(mapping, seed=matching.seed), matching, replace(world, gcp=gcp)
+        mapper, mapping, matching, drop_contradicted, command_line(), replace(world, gcp=gcp)
     )
     report = run(project, pairs, output, options, rounds)
     if as_json:
@@ -296,6 +306,7 @@ def reconstruct(
     print_models(report)
     say(*report_lines(report))
     click.echo(f"Matches are in {project.database}, models in {report.output}.")
+    say_verdict(report.quality)
 
 
 @cli.command()
@@ -345,9 +356,11 @@ def add(
         among_new,
         replace(features, masks=retrieval.masks),
         retrieval.seed,
+        command_line(),
     )
     report = add_photos(project, sparse, options, output)
     say(*add_lines(report))
+    say_verdict(report.quality)
     finish_partial([f"Left out: {name} {reason}" for name, reason in report.features.bad])
 
 
@@ -472,6 +485,51 @@ def merge(
 
     options = MergeOptions(method, retrieval, across)
     say(*merge_lines(merge_models(project, sparse, output, options)))
+
+
+@cli.command()
+@click.option(
+    "--sparse",
+    type=PATH,
+    required=True,
+    help="Folder of a COLMAP model, made by whomever; of several models in it the largest.",
+)
+@click.option(
+    "--db",
+    "--database_path",
+    "database",
+    type=PATH,
+    help="COLMAP database it was made from.  [default: project.db or database.db beside the model]",
+)
+@click.option(
+    "--images",
+    "--image_path",
+    "images",
+    type=PATH,
+    help="Folder that image names are relative to.  [default: images beside the database]",
+)
+@output_option(help="The page.  [default: report.html in the model's folder]")
+@verbose_option
+def report(sparse: Path, database: Path | None, images: Path | None, output: Path | None) -> None:
+    """Write the quality report of a model as one page, and say the verdict.
+
+    Database and photos are only read; what is missing (database, photos, GPS) the page says.
+    `reconstruct` and `add` write it beside every model they make.
+    """
+    from colmap_netvlad.commands.report import report as run
+
+    say_verdict([run(sparse, database, images, output)])
+
+
+def say_verdict(reports: Sequence[FlightReport]) -> None:
+    """Print the verdict on the largest model, and where the pages of smaller ones are."""
+    say(*(reports[0].lines if reports else ()))
+    say(*(f"Report of a smaller model: {other.page}" for other in reports[1:]))
+
+
+def command_line() -> str:
+    """Return the command as the user gave it."""
+    return shlex.join(["colmap-netvlad", *sys.argv[1:]])
 
 
 @cli.command()

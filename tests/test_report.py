@@ -22,8 +22,10 @@ from colmap_netvlad.comparison.result import MethodResult, ModelFigures, Retriev
 from colmap_netvlad.graph.pair import as_pair
 from colmap_netvlad.report.comparison import write_csv
 from colmap_netvlad.report.examples import choose_examples, hardest_images
-from colmap_netvlad.report.layout import align, from_above, lay_out, similarity
-from colmap_netvlad.report.measures import MEASURES, seconds
+from colmap_netvlad.report.layout import align, lay_out
+from colmap_netvlad.report.measures import MEASURES
+from colmap_netvlad.report.moves import from_above, similarity
+from colmap_netvlad.report.numbers import seconds
 from colmap_netvlad.report.page import render_page
 from colmap_netvlad.terminal import print_comparison
 
@@ -41,7 +43,7 @@ def page(small) -> str:
 class Outline(HTMLParser):
     """Collects what the tests ask about, and checks that tags are nested."""
 
-    VOID = frozenset({"meta", "link", "img", "br"})
+    VOID = frozenset({"meta", "link", "img", "br", "input"})
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -285,7 +287,7 @@ def test_the_ground_lies_in_the_page_with_the_cameras_above_and_not_mirrored():
     plan = Plan(
         tuple("abcdefghijklmnopqrst"), cameras @ turn.T, ground @ turn.T, np.zeros((500, 3))
     )
-    move = from_above(plan)
+    move = from_above(plan.centres, plan.points)
     seen_cameras, seen_ground = move(plan.centres), move(plan.points)
     assert seen_cameras[:, 2].min() > seen_ground[:, 2].max()
     assert np.ptp(seen_ground[:, 2]) < 12
@@ -322,3 +324,48 @@ def test_without_model_and_gps_the_view_graph_gives_the_places(small):
     nowhere = np.full((len(evidence.names), 3), np.nan)
     layout = lay_out(replace(evidence, positions=nowhere, plans={}))
     assert "spectral" in layout.source and layout.placed.all()
+
+
+# Times of methods that do less
+
+
+def timed(name: str, registered: int, seconds: float) -> MethodResult:
+    figures = RetrievalFigures(5, 100, 90, 0.9, None, 1, 9, 0, 0)
+    model = ModelFigures(5, 2, registered, 10, 20, 0.5, 2.0, registered + 7, 1.0)
+    return MethodResult(
+        name, "", seconds_describe=1.0, seconds_search=1.0, seconds_match=seconds,
+        at_k=(figures,), model=model,
+    )  # fmt: skip
+
+
+def test_least_time_is_said_only_of_methods_whose_model_is_as_complete(small):
+    hasty, slow, slower = timed("vlad", 42, 10.0), timed("a", 79, 60.0), timed("b", 79, 90.0)
+    assert best("seconds_total", hasty, slow, slower) == {"a"}
+    assert best("seconds_match", hasty, slow) == set()
+    assert best("seconds_total", hasty, timed("a", 42, 60.0)) == {"vlad"}
+    comparison = replace(small[0], methods=(hasty, slow, slower), images=123)
+    evidence = replace(
+        small[1],
+        pairs={"vlad": set(), "a": set(), "b": set()},
+        partners=dict.fromkeys(("vlad", "a", "b"), small[1].partners["vlad"]),
+        plans={},
+    )
+    text = render_page(comparison, evidence)
+    assert "Least time in all: a (" in text and ", of those with the fullest models)" in text
+
+
+def test_photos_of_all_models_are_counted_beside_the_largest():
+    shown = {m.key: m.show(timed("a", 42, 1.0)) for m in MEASURES}
+    assert (shown["registered"], shown["in_any_model"]) == ("42", "49")
+    earlier = MethodResult("a", "", model=ModelFigures(5, 1, 42))
+    assert next(m for m in MEASURES if m.key == "in_any_model").show(earlier) == "–"
+
+
+def test_sentences_of_the_view_graphs_are_kept_apart(small):
+    comparison, evidence = small
+    positions = evidence.positions.copy()
+    positions[5:] = np.nan
+    joined = {as_pair(evidence.names[0], evidence.names[5])}
+    evidence = replace(evidence, truth=joined, plans={}, positions=positions)
+    text = render_page(comparison, evidence)
+    assert "verified partners. 54 images could not be placed." in text

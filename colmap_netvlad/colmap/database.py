@@ -46,6 +46,26 @@ class ImageRow:
     height: int
 
 
+@dataclass(frozen=True)
+class InitialCamera:
+    """A camera as it was before any adjustment: COLMAP's model number and parameters, and whether
+    its focal length comes from EXIF (or from the user) rather than being a guess."""
+
+    model: int
+    params: tuple[float, ...]
+    prior: bool
+
+
+@dataclass(frozen=True, eq=False)
+class PairGeometry:
+    """COLMAP's two-view geometry: its kind, and the (3, 3) matrices that were estimated."""
+
+    config: int
+    F: NDArray[np.float64] | None
+    E: NDArray[np.float64] | None
+    H: NDArray[np.float64] | None
+
+
 def pair_id(image_id1: int, image_id2: int) -> int:
     """Return COLMAP's id of an image pair, whatever the order of its images."""
     low, high = sorted((image_id1, image_id2))
@@ -76,6 +96,18 @@ class Database:
             " FROM images i LEFT JOIN cameras c USING (camera_id) ORDER BY i.image_id"
         )
         return [ImageRow(*row) for row in rows]
+
+    def cameras(self) -> dict[int, InitialCamera]:
+        """Return the cameras by their ids."""
+        rows = self.connection.execute(
+            "SELECT camera_id, model, params, prior_focal_length FROM cameras"
+        )
+        return {
+            camera_id: InitialCamera(
+                model, tuple(np.frombuffer(params or b"", np.float64).tolist()), bool(prior)
+            )
+            for camera_id, model, params, prior in rows
+        }
 
     def keypoint_counts(self) -> dict[int, int]:
         """Return the number of keypoints by image id; images without features are absent."""
@@ -161,6 +193,16 @@ class Database:
             return np.zeros((0, 2), np.uint32)
         matches = np.frombuffer(row[1], np.uint32).reshape(row[0], 2)
         return matches if image_id1 <= image_id2 else matches[:, ::-1]
+
+    def geometry(self, image_id1: int, image_id2: int) -> PairGeometry | None:
+        """Return the two-view geometry of a pair, ids ascending; None where it was not verified."""
+        row = self.connection.execute(
+            "SELECT config, F, E, H FROM two_view_geometries WHERE pair_id = ? AND rows > 0",
+            (pair_id(image_id1, image_id2),),
+        ).fetchone()
+        if row is None:
+            return None
+        return PairGeometry(row[0], *(_matrix(blob) for blob in row[1:]))
 
     def pose_priors(self) -> dict[int, PosePrior]:
         """Return the position priors by image id, from any COLMAP version.
@@ -254,6 +296,12 @@ def open_database(path: Path, wait: float = BUSY_SECONDS) -> Iterator[Database]:
         raise InputError(
             f"{path} is not a COLMAP database (not a readable sqlite file: {fault})."
         ) from fault
+
+
+def _matrix(blob: bytes | None) -> NDArray[np.float64] | None:
+    """Read a (3, 3) matrix, kept row by row; older versions write zeros where there is none."""
+    values = np.frombuffer(blob or b"", np.float64)
+    return values.reshape(3, 3) if values.size == 9 and values.any() else None
 
 
 def _connect(path: Path, wait: float) -> sqlite3.Connection:

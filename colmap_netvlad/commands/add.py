@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from colmap_netvlad.cache.ranking import NO_PARTNER, Ranking
 from colmap_netvlad.colmap.database import image_names
 from colmap_netvlad.colmap.features import FeatureOptions, FeatureReport, extract_features
+from colmap_netvlad.commands.report import FlightReport, report_models, run_of
 from colmap_netvlad.mapping.extend import extend_model, largest_model, read_model
 from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.mapping.output import free_output
@@ -34,6 +35,7 @@ class AddOptions:
         among_new: pair the new photos with each other too, not only with the old ones.
         features: how the new photos are imported.
         seed: of matching and mapping.
+        command: the command line that asked for it, for the quality report.
     """
 
     method: str = "hybrid"
@@ -41,6 +43,7 @@ class AddOptions:
     among_new: bool = False
     features: FeatureOptions = field(default_factory=FeatureOptions)
     seed: int = 0
+    command: str = ""
 
 
 @dataclass(frozen=True)
@@ -55,6 +58,7 @@ class AddReport:
         output: folder of the extended model.
         unregistered: new photos without a pose in the model.
         seconds: duration by stage, s.
+        quality: the extended model's quality report.
     """
 
     new: list[str]
@@ -65,6 +69,7 @@ class AddReport:
     output: Path
     unregistered: list[str]
     seconds: dict[str, float]
+    quality: list[FlightReport] = field(default_factory=list)
 
 
 def add_photos(
@@ -122,6 +127,8 @@ def add_photos(
         MappingOptions(seed=options.seed),
     )
     seconds["mapping"] = time.monotonic() - start
+    run = run_of(options.command or "add, called from Python", seconds, asdict(options))
+    quality = report_models(target, project.database, folder, run)
     registered = registered_names([after])
     return AddReport(
         new=usable,
@@ -132,6 +139,7 @@ def add_photos(
         output=target,
         unregistered=[name for name in usable if name not in registered],
         seconds=seconds,
+        quality=quality,
     )
 
 

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import tempfile
 import time
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from colmap_netvlad.colmap.copies import copy_with_pairs
 from colmap_netvlad.colmap.database import image_names
 from colmap_netvlad.commands.georegister import (
     Placed,
@@ -24,9 +28,14 @@ from colmap_netvlad.commands.match import (
     view_graph_lines,
 )
 from colmap_netvlad.commands.match import as_json as match_json
+from colmap_netvlad.commands.report import FlightReport, report_models, run_of
+from colmap_netvlad.flight import open_flight
 from colmap_netvlad.geo.align import MIN_PLACES
 from colmap_netvlad.geo.gcp import ControlList
 from colmap_netvlad.geo.places import Places, find_deviations, find_places
+from colmap_netvlad.graph.lookalikes import find_lookalikes
+from colmap_netvlad.graph.pair import Pair
+from colmap_netvlad.graph.verified import verified_by_name
 from colmap_netvlad.mapping import MAPPERS, WITH_PRIORS
 from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.mapping.output import free_output
@@ -47,12 +56,16 @@ class ReconstructOptions:
         mapper: name in `mapping.MAPPERS`.
         mapping: what the mapper is told.
         matching: how pairs are matched.
+        drop_contradicted: leave pairs that look like look-alikes out of the mapping.
+        command: the command line that asked for it, for the quality report.
         world: how models are brought into the world.
     """
 
     mapper: str = "auto"
     mapping: MappingOptions = MappingOptions()
     matching: MatchOptions = MatchOptions()
+    drop_contradicted: bool = False
+    command: str = ""
     world: WorldOptions = WorldOptions()
 
 
@@ -68,6 +81,8 @@ class ReconstructReport:
         total: figures of all models together.
         missing: names of the images without a pose in any model.
         seconds: duration by stage, s.
+        dropped: contradicted pairs that were left out of the mapping.
+        quality: the quality report of each model, the largest first.
         placed: where each model is in the world; empty where that was not asked or no position
             is known.
         notes: how good the positions are taken to be, and what was put aside among them.
@@ -80,6 +95,8 @@ class ReconstructReport:
     total: ModelSummary
     missing: list[str] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
+    dropped: list[Pair] = field(default_factory=list)
+    quality: list[FlightReport] = field(default_factory=list)
     placed: list[Placed] = field(default_factory=list)
     notes: tuple[str, ...] = ()
 
@@ -91,7 +108,7 @@ def reconstruct(
     options: ReconstructOptions = ReconstructOptions(),
     rounds: RoundsOptions | None = None,
 ) -> ReconstructReport:
-    """Match pairs, map, and write the sparse models.
+    """Match pairs, map, and write the sparse models, each with its quality report.
 
     It writes matches into the project's database, where COLMAP keeps them. Pairs matched before
     are not matched again.
@@ -124,7 +141,9 @@ def reconstruct(
         notes = (note, *notes)
     target = free_output(output or project.sparse)
     start = time.monotonic()
-    models = MAPPERS[options.mapper](project.database, project.images, target, mapping)
+    mapper = MAPPERS[options.mapper]
+    with mapping_database(project, options.drop_contradicted) as (database, dropped):
+        models = mapper(database, project.images, target, mapping)
     seconds = {"matching": matches.seconds, "mapping": time.monotonic() - start}
     if not models:
         raise InputError(
@@ -136,6 +155,9 @@ def reconstruct(
         placed = georegister_in_place(
             target, places, control, adjusted=options.world.use_gps, seed=mapping.seed
         )
+    run = run_of(options.command or "reconstruct, called from Python", seconds, asdict(options))
+    run = replace(run, dropped=len(dropped))
+    quality = report_models(target, project.database, project.images, run)
     registered = registered_names(models)
     names = image_names(project.database)
     return ReconstructReport(
@@ -146,6 +168,8 @@ def reconstruct(
         total=combine(models),
         missing=[name for name in names if name not in registered],
         seconds=seconds,
+        dropped=dropped,
+        quality=quality,
         placed=placed,
         notes=notes,
     )
@@ -192,6 +216,38 @@ def _with_priors(
     return replace(options.mapping, priors=priors), note
 
 
+@contextmanager
+def mapping_database(project: Project, drop: bool) -> Iterator[tuple[Path, list[Pair]]]:
+    """Yield the database to map from, and the pairs it lacks.
+
+    Where contradicted pairs are to be dropped it is a copy without them, gone after the block:
+    the project's database keeps every match.
+    """
+    dropped = contradicted_pairs(project) if drop else []
+    if not dropped:
+        yield project.database, []
+        return
+    left_out = set(dropped)
+    kept = [pair for pair in verified_by_name(project.database) if pair not in left_out]
+    with tempfile.TemporaryDirectory(prefix=".lookalikes.", dir=project.folder) as folder:
+        copy = Path(folder) / project.database.name
+        copy_with_pairs(project.database, copy, kept)
+        yield copy, dropped
+
+
+def contradicted_pairs(project: Project) -> list[Pair]:
+    """Return the verified pairs that the pairs around them or GPS contradict.
+
+    Raises:
+        InputError: the database cannot be read.
+    """
+    with open_flight(project) as flight:
+        metres = flight.positions.metres
+        positions = dict(zip(flight.names, metres, strict=True))
+        found = find_lookalikes(flight.database, positions)
+    return [one.pair for one in found if one.contradicted]
+
+
 def check_mapper(name: str, *, use_gps: bool = False) -> None:
     """Raise InputError unless `name` is a mapper, and one that takes positions if they are used."""
     if name not in MAPPERS:
@@ -220,6 +276,10 @@ def report_lines(report: ReconstructReport) -> list[str]:
         where = f"Model {number}: " if len(report.placed) > 1 else ""
         lines += [where + line for line in placed.lines()]
     lines += report.notes
+    if report.dropped:
+        lines.append(
+            f"Look-alikes: {len(report.dropped):,} contradicted pairs were left out of the mapping."
+        )
     if report.missing:
         lines.append(
             f"Not registered: {len(report.missing)} of {report.images} images: "
@@ -237,9 +297,11 @@ def as_json(report: ReconstructReport) -> dict[str, Any]:
         "total": report.total,
         "models": report.models,
         "missing": report.missing,
+        "dropped": report.dropped,
         "seconds": report.seconds,
         "georeferences": [
             placed.georeference and placed.georeference.summary() for placed in report.placed
         ],
+        "quality": [{"page": page.page, "verdict": page.verdict} for page in report.quality],
         **match_json(report.matching),
     }

@@ -18,7 +18,7 @@ from colmap_netvlad.comparison.result import ModelFigures
 from colmap_netvlad.graph.pair import Pair
 from colmap_netvlad.mapping.incremental import map_incremental
 from colmap_netvlad.mapping.options import MappingOptions
-from colmap_netvlad.mapping.summary import summarize
+from colmap_netvlad.mapping.summary import registered_names, summarize
 from colmap_netvlad.runtime.files import atomic_path, write_atomically
 
 FIGURES = "figures.json"
@@ -68,6 +68,7 @@ def reconstruct_once(
             observations=summary.observations,
             mean_reprojection_error=summary.mean_reprojection_error if summary.points else None,
             mean_track_length=summary.mean_track_length if summary.points else None,
+            in_any_model=len(registered_names(models)),
             seconds=seconds,
         )
         _save_plan(folder / "plan.npz", largest)

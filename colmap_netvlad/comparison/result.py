@@ -58,6 +58,8 @@ class ModelFigures:
         models: how many separate models the mapper made; 0 where nothing registered.
         registered, points, observations, mean_reprojection_error (px), mean_track_length: of the
             largest model; 0 or None where there is none.
+        in_any_model: images in the largest or any other of its models; None where it was made
+            before this was counted.
         seconds: mapping, s.
         failed: the mapper's fault, where it did not finish.
     """
@@ -69,6 +71,7 @@ class ModelFigures:
     observations: int = 0
     mean_reprojection_error: float | None = None
     mean_track_length: float | None = None
+    in_any_model: int | None = None
     seconds: float = 0.0
     failed: str | None = None
 

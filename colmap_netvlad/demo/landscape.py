@@ -14,9 +14,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Ground = Literal["village", "plantation", "bare"]
+Ground = Literal["village", "plantation", "bare", "copies"]
 """village: fields, roads, houses, trees. plantation: equal palms in rows, the repetitive texture
-that confuses retrieval. bare: sand with few marks, the weak texture that starves SIFT."""
+that confuses retrieval. bare: sand with few marks, the weak texture that starves SIFT. copies: the
+same estate, houses and orchard rows alike to the last tile, again and again on flat fields: look-
+alike places that verify as one."""
+
+ESTATE, ESTATE_STEP = 64.0, 110.0
+"""Side of an estate of "copies", and the distance from one to its copy, m."""
 
 FloatImage = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -82,7 +87,12 @@ class Landscape:
         self._walls: list[tuple[float, float, float]] = [(0.0, 0.0, 0.0)]
         self._angle = self._rng.uniform(-0.6, 0.6)
         self._mottle = self._noise(2.0, 3)
-        {"village": self._village, "plantation": self._plantation, "bare": self._bare}[ground]()
+        {
+            "village": self._village,
+            "plantation": self._plantation,
+            "bare": self._bare,
+            "copies": self._copies,
+        }[ground]()
         self._grain(0.015 if ground == "bare" else 0.07)
         self._light()
         self.eaves = np.array(self._eaves, np.float32)
@@ -128,6 +138,37 @@ class Landscape:
         self.colour = sand[self._rng.integers(len(sand))] * shade[..., None]
         for e, n in self._scatter(0.0015):
             self._tree(e, n, self._rng.uniform(0.4, 1.2), self._rng.uniform(0.3, 0.9))
+
+    def _copies(self) -> None:
+        self.ground[:] = 0
+        self.height[:] = 0
+        self._fields()
+        self._patches()
+        self._estate()
+        half = self._cells(ESTATE / 2)
+        row, column = self._cell_of(0.0, 0.0)
+        source = slice(row - half, row + half), slice(column - half, column + half)
+        grids = (self.colour, self.height, self.house, self.wall_along, self.wall_light)
+        estate = [grid[source].copy() for grid in grids]
+        step = self._cells(ESTATE_STEP)
+        for r in range(row % step, self.shape[0], step):
+            for c in range(column % step, self.shape[1], step):
+                if half <= r < self.shape[0] - half and half <= c < self.shape[1] - half:
+                    target = slice(r - half, r + half), slice(c - half, c + half)
+                    for grid, painted in zip(grids, estate, strict=True):
+                        grid[target] = painted
+
+    def _estate(self) -> None:
+        """Houses in two rows, a lane between them, and an orchard, around the origin."""
+        lane = np.column_stack([np.arange(-30.0, 31.0, 2.0), np.full(31, 8.0)])
+        self._angle = 0.0
+        self._road(lane, 5.0, True)
+        for east in np.arange(-22.0, 25.0, 15.0):
+            for north in (20.0, -4.0):
+                self._house(east, north, 5.5, 4.2, self._rng.normal(0, 0.05))
+        for east in np.arange(-28.0, 29.0, 5.0):
+            for north in np.arange(-29.0, -13.0, 5.0):
+                self._tree(east, north, self._rng.uniform(1.2, 1.9), self._rng.uniform(2.5, 4.0))
 
     # What is painted
 

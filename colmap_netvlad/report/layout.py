@@ -8,15 +8,10 @@ from dataclasses import dataclass
 import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from colmap_netvlad.comparison.evidence import Evidence, Plan
 from colmap_netvlad.graph.pair import Pair
-
-LEAST_SPREAD = 0.02
-"""Points on a line to within this share of its length do not fix a rotation."""
-
-Points = NDArray[np.float64]
+from colmap_netvlad.report.moves import Points, from_above, similarity
 
 NOWHERE = np.full(3, np.nan)
 
@@ -58,7 +53,7 @@ def lay_out(evidence: Evidence) -> Layout:
         method, plan = best
         target = np.array([known.get(name, NOWHERE) for name in plan.names])
         onto_positions = similarity(plan.centres, target)
-        move = onto_positions or from_above(plan)
+        move = onto_positions or from_above(plan.centres, plan.points)
         placed, metric = dict(zip(plan.names, move(plan.centres), strict=True)), False
         source = f"camera positions of the model of {method}, seen from above"
         if onto_positions:
@@ -84,55 +79,8 @@ def align(plan: Plan, layout: Layout) -> Plan:
     target = np.array([layout.xyz[index[name]] for name in plan.names]).reshape(-1, 3)
     move = similarity(plan.centres, target)
     if move is None:
-        move = from_above(plan)
+        move = from_above(plan.centres, plan.points)
     return Plan(plan.names, move(plan.centres), move(plan.points), plan.colours)
-
-
-class Move:
-    """A similarity transform of 3D points: scale, rotation, translation."""
-
-    def __init__(self, scale: float, rotation: NDArray[np.float64], origin: Points, target: Points):
-        self._linear = scale * rotation
-        self._origin, self._target = origin, target
-
-    def __call__(self, points: Points) -> Points:
-        return (points - self._origin) @ self._linear.T + self._target
-
-
-def similarity(source: Points, target: Points) -> Move | None:
-    """Return the least-squares similarity from (N, 3) onto (N, 3), or None where it is not fixed:
-    fewer than three common finite points, or points on a line."""
-    both = np.isfinite(source).all(axis=1) & np.isfinite(target).all(axis=1)
-    source, target = source[both], target[both]
-    if len(source) < 3:
-        return None
-    origin, middle = source.mean(axis=0), target.mean(axis=0)
-    a, b = source - origin, target - middle
-    for spread in (np.linalg.svd(a, compute_uv=False), np.linalg.svd(b, compute_uv=False)):
-        if spread[1] <= LEAST_SPREAD * spread[0]:
-            return None
-    rotation, _ = Rotation.align_vectors(b, a)
-    matrix = rotation.as_matrix()
-    scale = float((b * (a @ matrix.T)).sum() / (a**2).sum())
-    return Move(scale, matrix, origin, middle) if scale > 0 else None
-
-
-def from_above(plan: Plan) -> Move:
-    """Return the rotation that lays the ground into the page, cameras above it.
-
-    The ground's normal is the direction in which points and cameras spread least: a drone's
-    flight is wide and flat.
-    """
-    cloud = np.vstack([plan.centres, _core(plan.points)])
-    middle = cloud.mean(axis=0)
-    axes = np.linalg.svd(cloud - middle, full_matrices=True)[2]
-    up, right = axes[2], axes[0]
-    above = plan.centres.mean(axis=0) - (
-        np.median(plan.points, axis=0) if len(plan.points) else middle
-    )
-    if above @ up < 0:
-        up = -up
-    return Move(1.0, np.array([right, np.cross(up, right), up]), middle, np.zeros(3))
 
 
 def spectral_positions(names: tuple[str, ...], pairs: Collection[Pair]) -> dict[str, Points]:
@@ -167,11 +115,3 @@ def _between_partners(
         if others
     }
     return {**placed, **found}, tuple(found)
-
-
-def _core(points: Points) -> Points:
-    """Drop the farthest tenth of the points: a few wild ones would tilt the ground."""
-    if len(points) < 10:
-        return points
-    distance = np.linalg.norm(points - np.median(points, axis=0), axis=1)
-    return points[distance <= np.quantile(distance, 0.9)]

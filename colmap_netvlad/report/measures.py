@@ -11,11 +11,20 @@ from colmap_netvlad.comparison.result import (
     ModelFigures,
     RetrievalFigures,
 )
+from colmap_netvlad.report.numbers import count, percent, seconds
 
-NOT_RUNNING = "exhaustive and random are not in the running"
+NOT_RUNNING = (
+    "exhaustive and random are not in the running, nor in times methods whose model lacks images"
+)
+
+COMPLETE = 0.99
+"""A model is as complete as the fullest with this share of its registered images."""
 
 MISSING = "–"
 """Stands where a method has no such figure."""
+
+
+RETRIEVAL, TIME, MODEL = "Retrieval", "Time", "Model"
 
 
 @dataclass(frozen=True)
@@ -48,10 +57,13 @@ class Measure:
     def best(self, methods: Sequence[MethodResult]) -> set[str]:
         """Return the names of the methods that are best, as far as the shown digits tell.
 
-        The exhaustive reference and the floor of chance are not in the running; where all are
-        equal none is best.
+        The exhaustive reference and the floor of chance are not in the running, and with a time
+        no method whose model lacks images that another's has; where all are equal none is best.
         """
-        values = {m.name: self.value(m) for m in methods if m.competes and not m.failed}
+        running = [m for m in methods if m.competes and not m.failed]
+        if self.group == TIME:
+            running = as_complete(running)
+        values = {m.name: self.value(m) for m in running}
         known = {name: value for name, value in values.items() if value is not None}
         if not self.better or len(known) < 2:
             return set()
@@ -60,23 +72,11 @@ class Measure:
         return best if len(best) < len(known) else set()
 
 
-def percent(value: float) -> str:
-    """Write 0..1 as per cent."""
-    return f"{100 * value:.1f} %"
-
-
-def count(value: float) -> str:
-    """Write a count with thousands separators."""
-    return f"{value:,.0f}"
-
-
-def seconds(value: float) -> str:
-    """Write a duration so that it reads at any length."""
-    if value < 0.01:
-        return "< 0.01 s" if value > 0 else "0 s"
-    if value < 100:
-        return f"{value:.2f} s" if value < 10 else f"{value:.1f} s"
-    return f"{value / 60:.1f} min" if value < 6000 else f"{value / 3600:.1f} h"
+def as_complete(methods: Sequence[MethodResult]) -> list[MethodResult]:
+    """Return the methods whose model has as many images as the fullest, or all without models."""
+    registered = [m.model.registered if m.model else 0 for m in methods]
+    least = COMPLETE * max(registered, default=0)
+    return [m for m, count in zip(methods, registered, strict=True) if count >= least]
 
 
 def _at_k(read: Callable[[RetrievalFigures], float | None]) -> Callable[..., float | None]:
@@ -106,8 +106,6 @@ def _pairs_per_image(method: MethodResult) -> float | None:
     pairs = next((figures.pairs for figures in method.at_k if figures.k == model.k), None)
     return None if pairs is None else pairs / model.registered
 
-
-RETRIEVAL, TIME, MODEL = "Retrieval", "Time", "Model"
 
 MEASURES: tuple[Measure, ...] = (
     Measure("pairs", "Image pairs", 0, _at_k(lambda f: f.pairs), count,
@@ -142,6 +140,8 @@ MEASURES: tuple[Measure, ...] = (
             "Retrieval, matching and mapping.", TIME),
     Measure("registered", "Registered images", +1, _of_model(lambda m: m.registered), count,
             "Images in the largest model.", MODEL),
+    Measure("in_any_model", "Images in all models", +1, _of_model(lambda m: m.in_any_model), count,
+            "Images in the largest model or a smaller one beside it.", MODEL),
     Measure("models", "Separate models", -1, _of_model(lambda m: m.models or None), count,
             "Models the mapper ended with; 1 is best.", MODEL),
     Measure("points", "3D points", +1, _of_model(lambda m: m.points), count,

@@ -21,7 +21,13 @@ from colmap_netvlad.report import plots
 from colmap_netvlad.report.comparison import notes_of, reference_sentence
 from colmap_netvlad.report.examples import FINDS, PARTNERS, choose_examples, hardest_images
 from colmap_netvlad.report.layout import Layout, align, lay_out
-from colmap_netvlad.report.measures import NOT_RUNNING, count, percent, seconds, shown
+from colmap_netvlad.report.measures import (
+    NOT_RUNNING,
+    TIME,
+    as_complete,
+    shown,
+)
+from colmap_netvlad.report.numbers import count, percent, seconds
 from colmap_netvlad.report.thumbnails import Thumbnails, data_uri
 
 
@@ -107,12 +113,19 @@ def _headlines(comparison: Comparison) -> list[str]:
         if named:
             value = measures[key].show(named[0])
             of = f" of {comparison.images:,}" if key == "registered" else ""
+            of += _only_complete(comparison) if measures[key].group == TIME else ""
             sentences.append(f"{phrase}: {_and(m.name for m in named)} ({value}{of}).")
     registered = {m.name: m.model.registered for m in comparison.methods if m.model and m.competes}
     if len(registered) > 1 and len(set(registered.values())) == 1:
         equal = next(iter(registered.values()))
         sentences.insert(0, f"All methods register {equal:,} of {comparison.images:,} images.")
     return sentences
+
+
+def _only_complete(comparison: Comparison) -> str:
+    """Say that a time is compared among the methods with the fullest models only, where it is."""
+    running = [m for m in comparison.methods if m.competes and not m.failed]
+    return "" if len(as_complete(running)) == len(running) else ", of those with the fullest models"
 
 
 def _curves(comparison: Comparison) -> list[tuple[str, Markup]]:
@@ -178,7 +191,10 @@ def _model_plans(comparison: Comparison, evidence: Evidence, layout: Layout) -> 
             f"{method.model.points:,} points"
         )
         if method.model.models > 1:
-            words += f" (the largest of {method.model.models} models)"
+            words += f" (the largest of {method.model.models} models"
+            if method.model.in_any_model is not None:
+                words += f", which have {method.model.in_any_model:,} images together"
+            words += ")"
         alt = f"Cameras and points of the model of {method.name}, seen from above: {words}."
         figures.append(Figure(method.name, data_uri("image/png", picture), alt, words))
     return figures

@@ -1,16 +1,12 @@
-"""The page's figures: charts as inline SVG that follow the page's colours, maps as PNG."""
+"""The figures of a comparison's page."""
 
 from __future__ import annotations
 
-import hashlib
-import io
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import matplotlib as mpl
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.colors import LogNorm
@@ -18,21 +14,11 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from colmap_netvlad.comparison.result import EXHAUSTIVE, Comparison, MethodResult
-from colmap_netvlad.report.measures import seconds as duration
-
-INK = "#010203"
-"""Stands for the page's text colour: replaced by `currentColor`, so charts follow dark mode."""
-
-COLOURS = (
-    "#0072b2", "#e69f00", "#009e73", "#d55e00", "#cc79a7", "#56b4e9", "#8c6bb1", "#a6761d",
-    "#5f9e3a", "#e7298a",
-)  # fmt: skip
-"""Okabe and Ito's palette without black and yellow, and four more: told apart by colour-blind
-readers, seen on white and on dark paper."""
+from colmap_netvlad.report.drawing import COLOURS, GREY, PAPER, STYLE, map_axes, png, svg_text
+from colmap_netvlad.report.numbers import seconds as duration
 
 MARKERS = "osD^vPX*<>"
 DASHES = ("-", "--", "-.", ":")
-REFERENCE_COLOUR = "#808080"
 
 STAGES = (
     ("Describing", "#0072b2", ""),
@@ -44,25 +30,6 @@ STAGES = (
 
 DRAWN_EDGES = 60_000
 """Edges drawn of a view graph; the weakest are left out first."""
-
-STYLE = {
-    "svg.fonttype": "none",
-    "svg.hashsalt": "colmap-netvlad",
-    "font.family": "sans-serif",
-    "font.size": 9.0,
-    "text.color": INK,
-    "axes.edgecolor": INK,
-    "axes.labelcolor": INK,
-    "xtick.color": INK,
-    "ytick.color": INK,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.linewidth": 0.6,
-    "grid.color": REFERENCE_COLOUR,
-    "grid.alpha": 0.25,
-    "hatch.color": "#ffffff",
-    "hatch.linewidth": 0.7,
-}
 
 
 @dataclass(frozen=True)
@@ -81,7 +48,7 @@ def looks(comparison: Comparison) -> dict[str, Look]:
         name: Look(COLOURS[i % len(COLOURS)], MARKERS[i % len(MARKERS)], DASHES[i % len(DASHES)])
         for i, name in enumerate(ranked)
     }
-    return {**styles, EXHAUSTIVE: Look(REFERENCE_COLOUR, "", ":")}
+    return {**styles, EXHAUSTIVE: Look(GREY, "", ":")}
 
 
 def curve(comparison: Comparison, field: str, title: str) -> str:
@@ -105,7 +72,7 @@ def curve(comparison: Comparison, field: str, title: str) -> str:
         axes.set_xticks(comparison.ks)
         axes.margins(x=0.06, y=0.12)
         axes.grid(axis="y")
-        return _svg(figure)
+        return svg_text(figure)
 
 
 def legend(comparison: Comparison) -> list[tuple[str, str]]:
@@ -120,7 +87,7 @@ def legend(comparison: Comparison) -> list[tuple[str, str]]:
             axes.plot([0, 1, 2], [0, 0, 0], color=look.colour, ls=look.dash, lw=1.8)
             axes.plot([1], [0], color=look.colour, marker=look.marker, markersize=5.5)
             axes.set_axis_off()
-            swatches.append((name, _svg(figure)))
+            swatches.append((name, svg_text(figure)))
     return swatches
 
 
@@ -150,7 +117,7 @@ def time_bars(comparison: Comparison) -> str:
         axes.tick_params(axis="y", length=0)
         figure.legend(loc="outside upper left", ncols=len(STAGES), frameon=False, fontsize=8,
                       handlelength=1.2, columnspacing=1.2)  # fmt: skip
-        return _svg(figure)
+        return svg_text(figure)
 
 
 def view_graph(
@@ -173,7 +140,7 @@ def view_graph(
     seen = drawn[edges].all(axis=1) if len(edges) else np.zeros(0, bool)
     edges, matches = edges[seen], matches[seen]
     order = np.argsort(matches, kind="stable")[-DRAWN_EDGES:]
-    with mpl.rc_context({**STYLE, **_PAPER}):
+    with mpl.rc_context({**STYLE, **PAPER}):
         figure = Figure(figsize=(4.6, 4.0), dpi=150, layout="constrained")
         axes = figure.subplots()
         top = max(strongest, 32)
@@ -194,7 +161,7 @@ def view_graph(
             axes.scatter(
                 xy[alone, 0], xy[alone, 1], s=size * 2 + 12, marker="x", color="#c1121f", zorder=4
             )
-        _map_axes(axes, xy[drawn], metric)
+        map_axes(axes, xy[drawn], metric)
         bar = figure.colorbar(
             ScalarMappable(norm, _EDGE_MAP), ax=axes, location="bottom", shrink=0.75, aspect=35
         )
@@ -202,7 +169,7 @@ def view_graph(
         bar.ax.minorticks_off()
         ticks = [t for t in (16, 30, 100, 300, 1000, 3000, 10000) if t <= top]
         bar.set_ticks(ticks, labels=[f"{t:,}" for t in ticks])
-        return _png(figure)
+        return png(figure)
 
 
 def model_plan(
@@ -221,7 +188,7 @@ def model_plan(
         window: (2, 2) lower left and upper right corner of the plan, equal for all methods.
         metric: whether the unit is the metre.
     """
-    with mpl.rc_context({**STYLE, **_PAPER}):
+    with mpl.rc_context({**STYLE, **PAPER}):
         figure = Figure(figsize=(4.6, 4.0), dpi=150, layout="constrained")
         axes = figure.subplots()
         if len(points):
@@ -230,10 +197,10 @@ def model_plan(
         size = float(np.clip(2400 / max(len(centres), 1), 2, 22))
         axes.scatter(centres[:, 0], centres[:, 1], s=size, marker="s", color="#1450d2",
                      edgecolors="#ffffff", linewidths=0.3, zorder=3)  # fmt: skip
-        _map_axes(axes, window, metric)
+        map_axes(axes, window, metric)
         axes.set_xlim(window[0, 0], window[1, 0])
         axes.set_ylim(window[0, 1], window[1, 1])
-        return _png(figure)
+        return png(figure)
 
 
 def plan_window(clouds: Sequence[NDArray[np.float64]], margin: float = 0.12) -> NDArray[np.float64]:
@@ -245,29 +212,6 @@ def plan_window(clouds: Sequence[NDArray[np.float64]], margin: float = 0.12) -> 
 
 
 _EDGE_MAP = mpl.colormaps["viridis_r"]
-
-_PAPER = dict.fromkeys(
-    ("text.color", "axes.edgecolor", "axes.labelcolor", "xtick.color", "ytick.color"), "#333333"
-)
-
-
-def _map_axes(axes: Axes, xy: NDArray[np.float64], metric: bool) -> None:
-    axes.set_aspect("equal")
-    if len(xy):
-        low, high = xy.min(axis=0), xy.max(axis=0)
-        edge = 0.05 * float(max((high - low).max(), 1e-6))
-        axes.set_xlim(low[0] - edge, high[0] + edge)
-        axes.set_ylim(low[1] - edge, high[1] + edge)
-    if metric:
-        axes.set_xlabel("east, m")
-        axes.set_ylabel("north, m")
-        axes.locator_params(nbins=5)
-    else:
-        axes.set_xticks([])
-        axes.set_yticks([])
-    for side in axes.spines.values():
-        side.set_visible(metric)
-        side.set_color("#bbbbbb")
 
 
 def _stages(method: MethodResult) -> tuple[float, float, float, float]:
@@ -282,24 +226,3 @@ def _stages(method: MethodResult) -> tuple[float, float, float, float]:
 
 def _longest(methods: Sequence[MethodResult]) -> float:
     return max((sum(_stages(method)) for method in methods), default=0.0)
-
-
-def _png(figure: Figure) -> bytes:
-    out = io.BytesIO()
-    figure.savefig(out, format="png", facecolor="#ffffff", metadata={"Software": None})
-    return out.getvalue()
-
-
-def _svg(figure: Figure) -> str:
-    """Return the figure as inline SVG: text as text in the page's font and colour, no id twice."""
-    out = io.StringIO()
-    figure.savefig(out, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
-    svg = out.getvalue()[out.getvalue().index("<svg") :]
-    svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
-    svg = svg.replace(INK, "currentColor")
-    svg = re.sub(r"<style.*?</style>", "", svg, flags=re.DOTALL)
-    svg = re.sub(r'font-family: [^;"]*;? ?', "", svg)
-    prefix = f"f{hashlib.sha256(svg.encode()).hexdigest()[:8]}-"
-    svg = re.sub(r'\bid="', f'id="{prefix}', svg)
-    svg = re.sub(r'(href="#|url\(#)', rf"\g<1>{prefix}", svg)
-    return svg.replace("<svg ", '<svg aria-hidden="true" focusable="false" ', 1).strip()
