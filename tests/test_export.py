@@ -22,7 +22,7 @@ from colmap_netvlad.demo.simulate import FRAME, SimulationOptions, simulate_flig
 from colmap_netvlad.export.geojson import footprint
 from colmap_netvlad.export.table import omega_phi_kappa
 from colmap_netvlad.export.world import World
-from colmap_netvlad.geo.frames import Frame
+from colmap_netvlad.geo.frames import LocalFrame
 from colmap_netvlad.geo.places import find_places
 from colmap_netvlad.mapping.incremental import map_incremental
 from colmap_netvlad.mapping.options import MappingOptions
@@ -274,7 +274,7 @@ def test_a_photo_to_the_horizon_has_no_footprint(exported: Exported) -> None:
 
 @pytest.mark.parametrize("latitude", [-33.9, 0.0, 61.0])
 def test_frames_and_systems_there_and_back(latitude: float) -> None:
-    frame = Frame(latitude, 18.4)
+    frame = LocalFrame(latitude, 18.4)
     places = np.random.default_rng(0).uniform(-2000, 2000, (20, 3))
     system = CRS.from_epsg(frame.epsg)
     assert frame.from_crs(frame.to_crs(places, system), system) == pytest.approx(places, abs=1e-4)
@@ -283,5 +283,5 @@ def test_frames_and_systems_there_and_back(latitude: float) -> None:
 
 def test_outlines_do_not_go_around_the_globe(exported: Exported) -> None:
     model = pycolmap.Reconstruction(exported.folder / "sparse/0")
-    world = World(model, Frame(-17.0, 179.9999), CRS.from_epsg(32760))
+    world = World(model, LocalFrame(-17.0, 179.9999), CRS.from_epsg(32760))
     assert np.ptp(world.wgs84[:, 1]) < 0.01

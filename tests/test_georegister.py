@@ -19,7 +19,7 @@ from PIL import Image
 from colmap_netvlad.cli import cli
 from colmap_netvlad.demo.exif import Exif, add_exif
 from colmap_netvlad.demo.simulate import FRAME, SimulationOptions, simulate_flight
-from colmap_netvlad.geo.frames import Frame
+from colmap_netvlad.geo.frames import LocalFrame
 from colmap_netvlad.geo.georeference import read_frame
 from colmap_netvlad.mapping.incremental import map_incremental
 from colmap_netvlad.mapping.options import MappingOptions
@@ -97,8 +97,8 @@ def test_distances_are_metres_and_reprojection_stays(mapped: Mapped, tmp_path: P
     )
 
 
-def with_photos(folder: Path, truth: dict[str, np.ndarray], frame: Frame, **changes: str) -> Path:
-    """Write tiny photos with EXIF GPS of the true places in a frame, some of them changed."""
+def with_photos(folder: Path, truth: dict[str, np.ndarray], frame: LocalFrame) -> Path:
+    """Write tiny photos with EXIF GPS of the true places in a frame."""
     tiny = folder / "tiny.jpg"
     Image.new("RGB", (16, 16)).save(tiny)
     images = folder / "fotos mit Umlaut ü"
@@ -113,15 +113,15 @@ def with_photos(folder: Path, truth: dict[str, np.ndarray], frame: Frame, **chan
 @pytest.mark.parametrize(
     ("frame", "epsg"),
     [
-        (Frame(-33.9, 18.4), 32734),  # southern hemisphere
-        (Frame(-17.0, 179.9999), 32760),  # across the antimeridian
-        (Frame(48.0, 11.9999), 32632),  # across the border of two UTM zones
-        (Frame(0.0, 6.5), 32632),  # at the equator
-        (Frame(-0.003, 6.5), 32732),
+        (LocalFrame(-33.9, 18.4), 32734),  # southern hemisphere
+        (LocalFrame(-17.0, 179.9999), 32760),  # across the antimeridian
+        (LocalFrame(48.0, 11.9999), 32632),  # across the border of two UTM zones
+        (LocalFrame(0.0, 6.5), 32632),  # at the equator
+        (LocalFrame(-0.003, 6.5), 32732),
     ],
 )
 def test_everywhere_on_the_globe_without_a_database(
-    mapped: Mapped, tmp_path: Path, frame: Frame, epsg: int
+    mapped: Mapped, tmp_path: Path, frame: LocalFrame, epsg: int
 ) -> None:
     images = with_photos(tmp_path, mapped.truth, frame)
     shutil.copytree(mapped.folder / "sparse/0", tmp_path / "models/0")

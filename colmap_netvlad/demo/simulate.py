@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pyproj import CRS
 from scipy.spatial import KDTree
 
-from colmap_netvlad.geo.frames import Frame
+from colmap_netvlad.geo.frames import LocalFrame
 
 WIDTH, HEIGHT, FOCAL, RADIAL = 1000, 750, 800.0, -0.02
 """The true camera: SIMPLE_RADIAL, px."""
@@ -22,7 +22,7 @@ WIDTH, HEIGHT, FOCAL, RADIAL = 1000, 750, 800.0, -0.02
 FLYING_HEIGHT = 100.0
 """Above the mean ground, m."""
 
-FRAME = Frame(53.3811, -1.4701)
+FRAME = LocalFrame(53.3811, -1.4701)
 """Where the simulated flight is: truth is m east, north, up of here."""
 
 REACH = 110.0

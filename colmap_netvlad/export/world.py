@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pyproj import CRS
 from scipy import sparse
 
-from colmap_netvlad.geo.frames import Frame
+from colmap_netvlad.geo.frames import LocalFrame
 
 Array = NDArray[np.float64]
 Pair = tuple[str, str]
@@ -37,7 +37,7 @@ class World:
     """
 
     model: pycolmap.Reconstruction
-    frame: Frame
+    frame: LocalFrame
     crs: CRS
     verified: dict[Pair, int] | None = field(default=None)
 

@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Frame:
+class LocalFrame:
     """East, north, up in m at an origin.
 
     Attributes:
@@ -93,7 +93,7 @@ class Frame:
         )
 
 
-def frame_of(geographic: Array) -> Frame:
+def frame_of(geographic: Array) -> LocalFrame:
     """Return the frame in the middle of a flight, its origin at height 0.
 
     Args:
@@ -102,7 +102,7 @@ def frame_of(geographic: Array) -> Frame:
     middle = middle_of(geographic)
     assert middle is not None
     latitude, longitude = middle.tolist()
-    return Frame(round(latitude, ORIGIN_DECIMALS), round(longitude, ORIGIN_DECIMALS))
+    return LocalFrame(round(latitude, ORIGIN_DECIMALS), round(longitude, ORIGIN_DECIMALS))
 
 
 def read_crs(text: str) -> CRS:

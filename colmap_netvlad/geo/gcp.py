@@ -16,7 +16,7 @@ from pyproj import CRS
 from scipy.optimize import least_squares
 
 from colmap_netvlad.geo.align import MIN_PLACES, NotAligned
-from colmap_netvlad.geo.frames import Frame, read_crs
+from colmap_netvlad.geo.frames import LocalFrame, read_crs
 from colmap_netvlad.runtime.errors import InputError
 
 Array = NDArray[np.float64]
@@ -77,7 +77,7 @@ class ControlList:
     def geographic(self) -> Array:
         """Return (N, 3) latitude, longitude (degrees), height of the points."""
         places = np.array([point.place for point in self.points]).reshape(-1, 3)
-        anywhere = Frame(0.0, 0.0)
+        anywhere = LocalFrame(0.0, 0.0)
         return anywhere.to_wgs84(anywhere.from_crs(places, self.crs))
 
 
@@ -187,7 +187,7 @@ def read_control(path: Path, photos: Collection[str], check: Collection[str] = (
 
 
 def align_to_control(
-    model: pycolmap.Reconstruction, control: ControlList, frame: Frame
+    model: pycolmap.Reconstruction, control: ControlList, frame: LocalFrame
 ) -> pycolmap.Sim3d:
     """Return the similarity from the model to the frame that its control points ask for.
 
@@ -215,7 +215,9 @@ def align_to_control(
     return similarity
 
 
-def adjust_to_control(model: pycolmap.Reconstruction, control: ControlList, frame: Frame) -> None:
+def adjust_to_control(
+    model: pycolmap.Reconstruction, control: ControlList, frame: LocalFrame
+) -> None:
     """Adjust a model in the frame with its control points held where they were surveyed, in place.
 
     Marks count as much as the model's own observations. The model keeps its points and tracks.
@@ -254,7 +256,7 @@ def adjust_to_control(model: pycolmap.Reconstruction, control: ControlList, fram
 
 
 def measure_control(
-    model: pycolmap.Reconstruction, control: ControlList, frame: Frame
+    model: pycolmap.Reconstruction, control: ControlList, frame: LocalFrame
 ) -> ControlReport:
     """Return how far each ground point's place in the model is from where it was surveyed."""
     names, check, residuals, pixels, notes = [], [], [], [], list(control.notes)
@@ -359,7 +361,7 @@ def _registered(model: pycolmap.Reconstruction) -> dict[str, pycolmap.Image]:
     return {image.name: image for image in images}
 
 
-def _surveyed(control: ControlList, frame: Frame) -> Array:
+def _surveyed(control: ControlList, frame: LocalFrame) -> Array:
     places = np.array([point.place for point in control.points]).reshape(-1, 3)
     return frame.from_crs(places, control.crs)
 

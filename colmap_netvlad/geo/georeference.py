@@ -11,7 +11,7 @@ import numpy as np
 import pycolmap
 
 from colmap_netvlad.geo.align import Alignment
-from colmap_netvlad.geo.frames import Frame
+from colmap_netvlad.geo.frames import LocalFrame
 from colmap_netvlad.geo.gcp import ControlReport
 from colmap_netvlad.geo.places import HEIGHTS
 from colmap_netvlad.runtime.errors import InputError
@@ -32,7 +32,7 @@ class Georeference:
         control: how ground points lie; None where there are none.
     """
 
-    frame: Frame | None
+    frame: LocalFrame | None
     alignment: Alignment
     adjusted: bool = False
     control: ControlReport | None = None
@@ -108,7 +108,7 @@ class Georeference:
         }
 
 
-def read_frame(folder: Path) -> Frame:
+def read_frame(folder: Path) -> LocalFrame:
     """Return the frame of a georegistered model.
 
     Raises:
@@ -123,7 +123,7 @@ def read_frame(folder: Path) -> Frame:
     try:
         origin = json.loads(path.read_text(encoding="utf-8"))["origin"]
         if origin is not None:
-            return Frame(*(float(origin[key]) for key in ("latitude", "longitude", "height")))
+            return LocalFrame(*(float(origin[key]) for key in ("latitude", "longitude", "height")))
     except (ValueError, KeyError, TypeError) as fault:
         raise InputError(f"{path} is damaged; run `colmap-netvlad georegister` again.") from fault
     raise InputError(

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_netvlad.colmap.database import open_database
-from colmap_netvlad.geo.frames import Frame, frame_of
+from colmap_netvlad.geo.frames import LocalFrame, frame_of
 from colmap_netvlad.photos.accuracy import read_deviations
 from colmap_netvlad.photos.positions import PosePrior, place, read_gps
 from colmap_netvlad.runtime import progress
@@ -40,7 +40,7 @@ class Places:
 
     names: tuple[str, ...]
     metres: Array
-    frame: Frame | None
+    frame: LocalFrame | None
     notes: tuple[str, ...]
 
     @property
@@ -92,7 +92,7 @@ def find_places(names: Sequence[str], database: Path | None, images: Path | None
 
 
 def in_frame(
-    names: Sequence[str], geographic: Array, frame: Frame, notes: tuple[str, ...] = ()
+    names: Sequence[str], geographic: Array, frame: LocalFrame, notes: tuple[str, ...] = ()
 ) -> Places:
     """Return places of (N, 3) latitude, longitude, height in a frame.
 
