@@ -76,6 +76,9 @@ contradicted by cycles."""
 MANY = 400
 """Verified matches from which on more do not make a pair count more."""
 
+POSED = 100
+"""Matches of a pair from which the angle between its views is found."""
+
 IRLS = 30
 """Repetitions of the weighted least squares."""
 
@@ -170,7 +173,8 @@ def read_moves(database: Database) -> Moves:
             matches = database.inlier_matches(a, b)
             first, second = keypoints(a)[matches[:, 0]], keypoints(b)[matches[:, 1]]
             turn, shift, misfit = _similarity(_plane(first, one), _plane(second, two))
-            tilt = _tilt(database, (a, b), one, two, first, second, matches)
+            some = slice(None, None, max(len(matches) // POSED, 1))
+            tilt = _tilt(database, (a, b), one, two, first[some], second[some])
             cover = min(_cover(first, one), _cover(second, two))
             width = two.width / two.mean_focal_length()
             row = (index[a], index[b], len(matches), turn, shift, misfit / width, tilt, cover)
@@ -295,7 +299,6 @@ def _tilt(
     two: pycolmap.Camera,
     first: NDArray[np.float32],
     second: NDArray[np.float32],
-    matches: NDArray[np.uint32],
 ) -> float:
     """Return the angle between the viewing directions of a pair, degrees; NaN where unknown."""
     kept = database.geometry(*pair)
@@ -306,7 +309,7 @@ def _tilt(
     for name in ("F", "E", "H"):
         if getattr(kept, name) is not None:
             setattr(geometry, name, getattr(kept, name))
-    count = np.arange(len(matches), dtype=np.uint32)
+    count = np.arange(len(first), dtype=np.uint32)
     geometry.inlier_matches = np.column_stack([count, count])
     try:
         known = pycolmap.estimate_two_view_geometry_pose(

@@ -17,6 +17,9 @@ Floats = NDArray[np.float64]
 OUTLIER = 3.0
 """A GPS position is put aside where its residual is this many times the median of all."""
 
+NEAR = 2.0
+"""A position this near is never put aside, m: it is GPS's own noise."""
+
 ROUNDS = 5
 """How often the fit onto GPS is repeated without what was put aside."""
 
@@ -78,7 +81,7 @@ def fit_frame(data: ModelData, positions: Floats) -> Frame:
             break
         move = better
         distance = np.linalg.norm(move(data.centres) - positions, axis=1)
-        near = distance <= OUTLIER * max(float(np.nanmedian(distance)), 1e-9)
+        near = distance <= max(OUTLIER * float(np.nanmedian(distance)), NEAR)
         if np.array_equal(near, used):
             break
         used = near
