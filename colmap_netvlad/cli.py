@@ -8,6 +8,7 @@ commands share stand in `cli_options`.
 from __future__ import annotations
 
 import json
+import signal
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -785,7 +786,8 @@ def finish_partial(left_out: list[str]) -> None:
 
 
 def main() -> None:
-    """Run the command line: the entry point `colmap-netvlad`."""
+    """Run the command line: the entry point `colmap-netvlad`. SIGTERM stops it as Ctrl-C does."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     cli()
 
 

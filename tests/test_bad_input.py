@@ -300,6 +300,24 @@ def test_ctrl_c_in_features_is_clean_and_the_next_run_completes(stage: str, tmp_
         assert len(colmap.images_with_features()) == 4
 
 
+def test_sigterm_stops_as_ctrl_c_does(project_copy: MakeProject) -> None:
+    project = project_copy()
+    script = INTERRUPT.replace("SIGINT", "SIGTERM").replace(
+        "from colmap_netvlad.cli import cli\ncli(sys.argv[2:])",
+        "from colmap_netvlad.cli import main\nsys.argv[1:] = sys.argv[2:]\nmain()",
+    )
+    arguments = ["pairs", "--db", str(project.database), "--method", "bow", "--k", "3"]
+    stage = "colmap_netvlad.runtime.workers:wait"
+    done = subprocess.run(
+        [sys.executable, "-c", script, stage, *arguments],
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 1 and done.stderr.strip() == "Aborted!", done.stderr
+    assert_no_leftovers(project.folder)
+
+
 def test_ctrl_c_while_a_vocabulary_tree_is_built_is_clean(project_copy: MakeProject) -> None:
     project = project_copy()
     arguments = ("pairs", "--db", project.database, "--method", "bow", "--k", 3)

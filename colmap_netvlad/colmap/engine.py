@@ -12,11 +12,12 @@ from __future__ import annotations
 import logging
 import os
 import shutil
+import signal
 import sqlite3
 import tempfile
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -35,6 +36,10 @@ LOCK_SECONDS = 5.0
 """How long to wait for another process's lock before saying so."""
 
 WATCH_SECONDS = 0.2
+
+# pycolmap takes SIGTERM to print a stack trace; what Python had is put back.
+with suppress(ValueError):  # not in the main thread
+    signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM))
 
 _logger = logging.getLogger("colmap_netvlad")
 

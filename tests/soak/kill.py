@@ -44,10 +44,12 @@ class Kind:
     Attributes:
         words: its words, where {} stands for the project's folder.
         sound: prepares the folder that it starts from.
+        makes: the folder that a finished run has made, where another run makes another.
     """
 
     words: tuple[str, ...]
     sound: Callable[[Path], None]
+    makes: str = ""
 
 
 def photos(folder: Path) -> None:
@@ -117,12 +119,15 @@ KINDS = {
     "pairs-bow": Kind(("pairs", *DB, "--method", "bow", "--k", "3"), features),
     "match": Kind(("match", *DB), listed),
     "match-rounds": Kind(("match", *DB, "--rounds", "2", "--k", "2", "--method", "vlad"), features),
-    "reconstruct": Kind(("reconstruct", *DB, *ONE), matched),
+    "reconstruct": Kind(("reconstruct", *DB, *ONE), matched, "sparse"),
     "reconstruct-parallel": Kind(
         ("reconstruct", *DB, "--mapper", "parallel", "--cluster-size", "4", "--threads", "1"),
         matched,
+        "sparse",
     ),
-    "add": Kind(("add", *DB, "--images", "{}/images", "--method", "vlad", "--k", "5"), built),
+    "add": Kind(
+        ("add", *DB, "--images", "{}/images", "--method", "vlad", "--k", "5"), built, "sparse-2"
+    ),
     "compare": Kind(
         ("compare", *DB, "--methods", "vlad,random", "--k", "2,3", "--no-reconstruct"), features
     ),
@@ -300,11 +305,17 @@ def main() -> int:
                     whole = state(folder)
                     wrong = left_behind(folder)
                 else:
+                    finished = False
                     for _ in range(random.integers(1, 4)):
                         after = float(random.uniform(0, 1.1 * seconds))
-                        kills += killed(folder, kind.words, after, bool(random.integers(2)))
+                        hit = killed(folder, kind.words, after, bool(random.integers(2)))
+                        kills += hit
                         check_whole(folder)
-                    run(folder, *kind.words)
+                        finished = bool(kind.makes) and (folder / kind.makes).exists()
+                        if finished or not hit:
+                            break
+                    if not finished:
+                        run(folder, *kind.words)
                     wrong = differences(state(folder), whole) + left_behind(folder)
             except (RuntimeError, sqlite3.Error) as fault:
                 wrong = [str(fault)]

@@ -1,0 +1,112 @@
+"""Fill the disk under commands at random points, make room, run them again, and compare.
+
+    python tests/soak/full.py pairs --times 30 --seed 0
+
+Each try puts a small project, or the temporary files of its commands, on a disk of its own (tmpfs:
+Linux, as root) with a random amount of room. Wanted is one sentence or success, nothing half
+written, and, with room again, the end of an undisturbed run. What COLMAP itself writes is guarded
+by 64 MiB that stay free; half of the tries have a little more than these.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import kill
+import numpy as np
+
+ROOM = 2**30
+GUARD = 64 * 2**20
+NEEDS = 12 * 2**20
+"""More than any command here writes."""
+
+
+def resize(disk: Path, size: int) -> None:
+    """Give a mounted tmpfs another size, bytes."""
+    options = f"remount,size={size}"
+    subprocess.run(["mount", "-o", options, str(disk)], check=True)
+
+
+def ended(folder: Path, words: tuple[str, ...]) -> tuple[int, str]:
+    """Run a command; return its exit code and what it printed."""
+    process, began = kill.start(folder, *words), time.monotonic()
+    while time.monotonic() - began < kill.LONGEST:
+        done, status = os.waitpid(process, os.WNOHANG)
+        if done:
+            log = (folder.parent / "log.txt").read_text(errors="replace")
+            return os.waitstatus_to_exitcode(status), log
+        time.sleep(0.01)
+    os.kill(process, 9)
+    raise RuntimeError(f"{words} hangs")
+
+
+def main() -> int:
+    """Fill the disk many times and print what went wrong; 1 where anything did."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("command", choices=kill.KINDS)
+    parser.add_argument("--times", type=int, default=30)
+    parser.add_argument("--seed", type=int, default=0)
+    chosen = parser.parse_args()
+    kind, random = kill.KINDS[chosen.command], np.random.default_rng(chosen.seed)
+    refused = faults = 0
+    with tempfile.TemporaryDirectory(prefix="full-") as top:
+        base, disk = Path(top, "base", "project"), Path(top, "disk")
+        base.mkdir(parents=True)
+        disk.mkdir()
+        kind.sound(base)
+        whole = Path(top, "whole", "project")
+        shutil.copytree(base, whole)
+        kill.run(whole, *kind.words)
+        wanted = kill.state(whole)
+        subprocess.run(["mount", "-t", "tmpfs", f"-osize={ROOM}", "tmpfs", str(disk)], check=True)
+        try:
+            for number in range(chosen.times):
+                folder = Path(top, f"try{number}", "project")
+                folder.parent.mkdir()
+                small = disk / f"try{number}"
+                small.mkdir()
+                if random.integers(3):  # the project's disk
+                    shutil.copytree(base, small / "project")
+                    folder.symlink_to(small / "project")
+                else:  # the temporary one
+                    shutil.copytree(base, folder)
+                    (folder.parent / "scratch").symlink_to(small)
+                used = shutil.disk_usage(disk).used
+                room = int(random.uniform(0, NEEDS)) + GUARD * int(random.integers(2))
+                resize(disk, (used + room) // 4096 * 4096 + 4096)
+                wrong = []
+                try:
+                    code, log = ended(folder, kind.words)
+                    if code and ("Traceback" in log or "Error: " not in log):
+                        wrong.append(f"{room} bytes of room, exit code {code}: {log[-1500:]}")
+                    refused += code != 0
+                    wrong += [f"left {left}" for left in kill.left_behind(folder.resolve())]
+                    resize(disk, ROOM)
+                    kill.check_whole(folder.resolve())
+                    kill.run(folder, *kind.words)
+                    wrong += kill.differences(kill.state(folder.resolve()), wanted)
+                except (RuntimeError, kill.sqlite3.Error) as fault:
+                    wrong.append(str(fault))
+                resize(disk, ROOM)
+                shutil.rmtree(small)
+                if wrong:
+                    faults += 1
+                    print(f"{chosen.command} {number} (--seed {chosen.seed}):", *wrong, sep="\n  ")
+        finally:
+            subprocess.run(["umount", "-l", str(disk)], check=True)
+    print(f"{chosen.command}: {chosen.times} tries, {refused} refused, {faults} with faults")
+    return 1 if faults else 0
+
+
+if __name__ == "__main__":
+    import pycolmap  # noqa: F401
+    import torch  # noqa: F401
+
+    sys.exit(main())
