@@ -2,10 +2,11 @@
 
 import logging
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 
 import pycolmap
+import pytest
 
 from colmap_netvlad.colmap import engine
 from colmap_netvlad.runtime import workers
@@ -94,3 +95,42 @@ def test_a_worker_is_as_talkative_as_its_parent(monkeypatch) -> None:
         )
         said.append(outcome.fault)
     assert said == ["20 3", "10 0"]
+
+
+def double(number: int) -> int:
+    if number < 0:
+        raise InputError(f"{number} is negative.")
+    return 2 * number
+
+
+def die_at(at: int, number: int) -> int:
+    if number == at:
+        os.kill(os.getpid(), 9)
+    return number
+
+
+def test_results_of_many_tasks_come_from_few_processes() -> None:
+    taken = []
+
+    def tasks() -> Iterator[int]:
+        for number in range(40):
+            taken.append(number)
+            yield number
+
+    results = workers.results(double, tasks(), 2)
+    first = next(results)
+    assert len(taken) <= 2 * workers.AHEAD + 2  # no more wait than are soon worked at
+    assert sorted([first, *results]) == list(range(0, 80, 2))
+
+
+def test_what_a_task_raises_ends_the_work() -> None:
+    with pytest.raises(InputError, match=r"-1 is negative\."):
+        list(workers.results(double, [1, 2, -1, *range(100)], 1))
+
+
+def test_a_process_that_is_killed_is_said_and_results_before_it_come() -> None:
+    came = []
+    with pytest.raises(InputError, match="crashed or was killed"):
+        for result in workers.results(partial(die_at, 5), range(9), 1):
+            came.append(result)
+    assert came and 5 not in came

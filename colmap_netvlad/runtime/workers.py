@@ -1,4 +1,5 @@
-"""Run jobs in processes of their own: one that crashes loses its own work only."""
+"""Run jobs in processes of their own: one that crashes loses its own work only; or many small
+tasks in a few processes."""
 
 from __future__ import annotations
 
@@ -8,11 +9,16 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Generator, Iterable, Sequence
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor
+from concurrent.futures import wait as wait_for_any
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
+from itertools import islice
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
-from typing import Any
+from typing import Any, TypeVar
 
 from colmap_netvlad.runtime.errors import InputError
 
@@ -22,8 +28,15 @@ POLL_SECONDS = 0.5
 KILL_SECONDS = 5.0
 """How long a worker may take to end when told to."""
 
+AHEAD = 2
+"""Tasks at hand for each process that is asked for results: one at work, one to go on with."""
+
 KILLED = 9
 """SIGKILL, which some systems have no name for."""
+
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
@@ -44,10 +57,12 @@ class Outcome:
     Attributes:
         fault: why it failed, or None.
         peak_bytes: the most memory its process held; 0 where it crashed.
+        seconds: how long its initialiser and function ran, s; 0 where its process crashed.
     """
 
     fault: str | None = None
     peak_bytes: int = 0
+    seconds: float = 0.0
 
 
 def _nothing() -> None:
@@ -113,8 +128,7 @@ def run(
 def _outcome(process: SpawnProcess, receiver: Connection) -> Outcome:
     with contextlib.suppress(EOFError), receiver:
         if receiver.poll():
-            fault, peak = receiver.recv()
-            return Outcome(fault, peak)
+            return Outcome(*receiver.recv())
     code = process.exitcode or 0
     if code == -KILLED:
         return Outcome("its process was killed, by the system for want of memory perhaps")
@@ -122,15 +136,13 @@ def _outcome(process: SpawnProcess, receiver: Connection) -> Outcome:
 
 
 def _work(job: Job, counter: Any, sender: Connection, initialiser: Callable[[], None]) -> None:
-    # Ctrl-C reaches the whole group; the parent alone decides and ends its workers.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    _begin()
 
     def advance(count: int = 1) -> None:
         with counter.get_lock():
             counter.value += count
 
-    fault = None
+    fault, start = None, time.monotonic()
     try:
         initialiser()
         job.function(advance, *job.arguments)
@@ -138,7 +150,48 @@ def _work(job: Job, counter: Any, sender: Connection, initialiser: Callable[[], 
         fault = known.message
     except Exception as unknown:
         fault = f"{type(unknown).__name__}: {unknown}"
-    sender.send((fault, _peak_bytes()))
+    sender.send((fault, _peak_bytes(), time.monotonic() - start))
+
+
+def results(
+    function: Callable[[Task], Result],
+    tasks: Iterable[Task],
+    workers: int,
+    initialiser: Callable[[], None] = _nothing,
+) -> Generator[Result, None, None]:
+    """Yield `function(task)` for every task as they are done, from `workers` processes.
+
+    For many small tasks, of which no more wait than are soon worked at. Functions and results are
+    sent between processes: module-level functions, or a `functools.partial` of one.
+
+    Raises:
+        InputError: a process crashed or was killed. What a task raises is raised here. Either
+            ends the work; results that were ready come first.
+    """
+    context = multiprocessing.get_context("spawn")
+    waiting = iter(tasks)
+    pool = ProcessPoolExecutor(workers, context, _begin, (initialiser,))
+    try:
+        running = {pool.submit(function, task) for task in islice(waiting, AHEAD * workers)}
+        while running:
+            done, running = wait_for_any(running, return_when=FIRST_COMPLETED)
+            for ended in sorted(done, key=lambda ended: ended.exception() is not None):
+                yield ended.result()
+            running |= {pool.submit(function, task) for task in islice(waiting, len(done))}
+    except BrokenProcessPool as fault:
+        raise InputError(
+            "A process of this run crashed or was killed, by the system for want of memory "
+            "perhaps; run the command again: it goes on where it stopped."
+        ) from fault
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _begin(initialiser: Callable[[], None] = _nothing) -> None:
+    # Ctrl-C reaches the whole group; the parent alone decides and ends its workers.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    initialiser()
 
 
 def _end_with_parent() -> None:
