@@ -34,6 +34,9 @@ FINGERPRINT_BYTES = 1024
 SIFT_BYTES = 128
 """Bytes of one SIFT descriptor; `descriptors.cols` counts bytes."""
 
+SIFT_TYPE = 0
+"""`descriptors.type` of SIFT (COLMAP 4 on); -1 where a database was made before."""
+
 
 @dataclass(frozen=True)
 class ImageRow:
@@ -128,12 +131,17 @@ class Database:
 
     def keypoints(self, image_id: int) -> NDArray[np.float32]:
         """Return (N, 2) keypoint positions x, y in pixels (COLMAP's: centre of pixel 0 is 0.5)."""
+        return self.keypoint_shapes(image_id)[:, :2]
+
+    def keypoint_shapes(self, image_id: int) -> NDArray[np.float32]:
+        """Return (N, 2), (N, 4) or (N, 6) keypoints: x, y; scale and orientation, or the four
+        numbers of an affine shape."""
         row = self.connection.execute(
             "SELECT rows, cols, data FROM keypoints WHERE image_id = ?", (image_id,)
         ).fetchone()
         if row is None or not row[0]:
             return np.zeros((0, 2), np.float32)
-        return np.frombuffer(row[2], np.float32).reshape(row[0], row[1])[:, :2]
+        return np.frombuffer(row[2], np.float32).reshape(row[0], row[1])
 
     def sift_descriptors(self, image_id: int) -> NDArray[np.uint8]:
         """Return (N, 128) SIFT descriptors as COLMAP keeps them, 0..255.
@@ -152,6 +160,15 @@ class Database:
                 "use a method that reads the photos, or extract SIFT."
             )
         return np.frombuffer(row[2], np.uint8).reshape(row[0], SIFT_BYTES)
+
+    def has_sift(self) -> bool:
+        """Whether there are SIFT descriptors and no others."""
+        known = "type" in self._columns("descriptors")
+        kind = "MAX(type)" if known else str(SIFT_TYPE)
+        longest, shortest, kind = self.connection.execute(
+            f"SELECT MAX(cols), MIN(cols), {kind} FROM descriptors WHERE rows > 0"
+        ).fetchone()
+        return longest == shortest == SIFT_BYTES and kind <= SIFT_TYPE
 
     def feature_fingerprints(self) -> dict[int, str]:
         """Return a fingerprint of each image's local descriptors, by image id.

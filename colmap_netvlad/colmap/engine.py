@@ -55,7 +55,7 @@ def check_writable(database: Path) -> None:
         raise InputError(
             f"Cannot write in the folder {database.parent}: {fault.strerror or fault}."
         ) from fault
-    _check_space(database.parent)
+    check_space(database.parent)
     if not database.exists():
         return
     with open_database(database):
@@ -106,7 +106,7 @@ def call(function: Callable[..., Result], folder: Path, *arguments: Any, **optio
     thread.start()
     try:
         while not finished.wait(WATCH_SECONDS):
-            _check_space(folder)
+            check_space(folder)
     except BaseException:
         token.cancel()
         finished.wait()
@@ -133,7 +133,8 @@ def _log_at(level: int) -> None:
     silence()
 
 
-def _check_space(folder: Path) -> None:
+def check_space(folder: Path) -> None:
+    """Raise InputError where the disk of a folder is nearly full."""
     free = shutil.disk_usage(folder).free
     if free < FREE_BYTES:
         raise InputError(
