@@ -28,6 +28,7 @@ from colmap_netvlad.cli_options import (
     k_option,
     mapping_options,
     masks_option,
+    matcher_options,
     matching_options,
     output_option,
     project_options,
@@ -51,7 +52,7 @@ if TYPE_CHECKING:
     from colmap_netvlad.commands.match import RoundsOptions
     from colmap_netvlad.commands.report import FlightReport
     from colmap_netvlad.mapping.options import MappingOptions
-    from colmap_netvlad.matching.run import MatchOptions
+    from colmap_netvlad.matching.options import MatchOptions
     from colmap_netvlad.project import Project
 
 
@@ -310,6 +311,7 @@ def reconstruct(
     help="Retrieval method; `colmap-netvlad methods` lists them.",
 )
 @retrieval_options
+@matcher_options
 @feature_options
 @verbose_option
 def add(
@@ -320,6 +322,7 @@ def add(
     k: int,
     method: str,
     retrieval: RetrievalOptions,
+    matching: MatchOptions,
     features: FeatureOptions,
 ) -> None:
     """Register new photos into an existing model.
@@ -338,6 +341,7 @@ def add(
         replace(features, masks=retrieval.masks),
         retrieval.seed,
         command_line(),
+        matching,
     )
     report = add_photos(project, sparse, options, output)
     say(*add_lines(report))
@@ -480,6 +484,7 @@ def demo(output: Path, method: str | None, seed: int) -> None:
     help="Partners retrieved for each image, one number or several: 10,20,30.",
 )
 @retrieval_options
+@matcher_options
 @output_option(
     help="Folder of the comparison.  [default: <database>-compare beside the database]",
 )
@@ -500,6 +505,7 @@ def compare(
     methods: str,
     k: tuple[int, ...],
     retrieval: RetrievalOptions,
+    matching: MatchOptions,
     output: Path | None,
     reconstruct: bool,
     reconstruct_k: int | None,
@@ -526,6 +532,7 @@ def compare(
         reconstruct_k=reconstruct_k,
         retrieval=retrieval,
         seed=retrieval.seed,
+        matching=matching,
     )
     names = [name.strip() for name in methods.split(",") if name.strip()]
     report = run(project, names, options, ask)

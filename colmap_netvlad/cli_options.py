@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 from click.core import ParameterSource
 
+from colmap_netvlad.matching.options import MATCHER_DEFAULT, MatchOptions
 from colmap_netvlad.retrieval.options import COMPARED, GPS_MODES, RetrievalOptions
 from colmap_netvlad.terminal import VERBOSE
 
@@ -209,6 +210,36 @@ def retrieval_options(**values: Any) -> dict[str, Any]:
     return {"retrieval": RetrievalOptions(**values)}
 
 
+MATCHER: tuple[Callable[[Any], Any], ...] = (
+    click.option(
+        "--matcher",
+        help="Who matches: colmap (COLMAP's own), or guided (a glance tells where two photos"
+        " overlap, and features are looked for only there)."
+        f"  [default: {MATCHER_DEFAULT}]",
+    ),
+    click.option(
+        "--thorough",
+        is_flag=True,
+        help="Let guided search pairs in full whose glance shows nothing in common, instead of"
+        " giving them up.",
+    ),
+)
+
+
+def _match_options(matcher: str | None, thorough: bool, seed: int = 0) -> dict[str, MatchOptions]:
+    from colmap_netvlad.matching.matchers import find_matcher
+
+    matching = MatchOptions(matcher, thorough, seed)
+    find_matcher(matching)
+    return {"matching": matching}
+
+
+@bundle(*MATCHER)
+def matcher_options(matcher: str | None, thorough: bool) -> dict[str, Any]:
+    """Who matches, as `matching`; its seed is the retrieval's."""
+    return _match_options(matcher, thorough)
+
+
 @bundle(
     pairs_option,
     click.option(
@@ -230,13 +261,21 @@ def retrieval_options(**values: Any) -> dict[str, Any]:
         help="Retrieval method of --rounds; `colmap-netvlad methods` lists them.",
     ),
     *RETRIEVAL,
+    *MATCHER,
 )
 def matching_options(
-    pairs: Path | None, rounds: int | None, budget: int | None, k: int, method: str, **values: Any
+    pairs: Path | None,
+    rounds: int | None,
+    budget: int | None,
+    k: int,
+    method: str,
+    matcher: str | None,
+    thorough: bool,
+    **values: Any,
 ) -> dict[str, Any]:
-    """What to match: a pairs list, or pairs in rounds, as `pairs`, `rounds` and `matching`."""
+    """What to match and who does it: a pairs list, or pairs in rounds, as `pairs`, `rounds` and
+    `matching`."""
     from colmap_netvlad.commands.match import RoundsOptions
-    from colmap_netvlad.matching.run import MatchOptions
 
     if rounds is None:
         ignored = given("budget", "k", "method", *RETRIEVAL_NAMES)
@@ -247,7 +286,7 @@ def matching_options(
     return {
         "pairs": pairs,
         "rounds": None if rounds is None else RoundsOptions(rounds, budget, method, retrieval),
-        "matching": MatchOptions(seed=values["seed"]),
+        **_match_options(matcher, thorough, values["seed"]),
     }
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from colmap_netvlad.commands.add import AddOptions, add_photos, newest_model
 from colmap_netvlad.demo.render import RenderedFlight
 from colmap_netvlad.mapping.incremental import map_incremental
 from colmap_netvlad.mapping.options import MappingOptions
+from colmap_netvlad.matching.options import MatchOptions
 from colmap_netvlad.matching.run import match_pairs
 from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval.options import RetrievalOptions
@@ -61,10 +63,11 @@ def test_new_photos_join_the_model_and_only_their_pairs_are_matched(
     for photo in photos:
         shutil.copy(photo, project.images / photo.name)
 
-    report = add_photos(project, newest_model(project), OPTIONS)
+    guided = replace(OPTIONS, matching=MatchOptions("guided"))
+    report = add_photos(project, newest_model(project), guided)
 
     assert report.new == sorted(photo.name for photo in photos)
-    assert report.unregistered == []
+    assert report.unregistered == [] and report.matches.matcher == "guided"
     assert report.after.registered == report.before.registered + NEW
     assert report.matches.matched <= NEW * OPTIONS.retrieval.k
     with open_database(project.database) as database:

@@ -21,6 +21,7 @@ from colmap_netvlad.colmap.database import open_database
 from colmap_netvlad.commands import annotate as module
 from colmap_netvlad.commands.annotate import AnnotateOptions, annotate, find_scenes, table_lines
 from colmap_netvlad.demo.render import RenderedFlight
+from colmap_netvlad.matching.options import MatchReport
 from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval.options import RetrievalOptions
 from colmap_netvlad.runtime.errors import EXIT_PARTIAL, InputError
@@ -211,7 +212,7 @@ def test_a_killed_run_goes_on_with_the_pairs_already_matched(
     reports = []
     original = matching.match_pairs
 
-    def counted(*arguments: object) -> matching.MatchReport:
+    def counted(*arguments: object) -> MatchReport:
         reports.append(original(*arguments))  # type: ignore[arg-type]
         return reports[-1]
 

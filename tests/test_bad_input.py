@@ -19,7 +19,7 @@ from photos import save_jpeg, scene
 from colmap_netvlad.cli import cli
 from colmap_netvlad.colmap import engine
 from colmap_netvlad.colmap.database import image_names, open_database
-from colmap_netvlad.matching import run as matching
+from colmap_netvlad.matching import colmap as matching
 from colmap_netvlad.project import Project
 from colmap_netvlad.runtime.errors import InputError
 from colmap_netvlad.runtime.files import write_atomically
@@ -300,18 +300,26 @@ def test_ctrl_c_in_features_is_clean_and_the_next_run_completes(stage: str, tmp_
         assert len(colmap.images_with_features()) == 4
 
 
-@pytest.mark.parametrize("stage", ["pycolmap:match_image_pairs", "pycolmap:incremental_mapping"])
+@pytest.mark.parametrize(
+    "stage, matcher",
+    [
+        ("pycolmap:match_image_pairs", "colmap"),
+        ("pycolmap:estimate_two_view_geometry", "guided"),
+        ("pycolmap:incremental_mapping", "colmap"),
+    ],
+)
 def test_ctrl_c_in_reconstruct_is_clean_and_the_next_run_completes(
-    stage: str, project_copy: MakeProject
+    stage: str, matcher: str, project_copy: MakeProject
 ) -> None:
     project = project_copy(matched="mapping" in stage)
     names = image_names(project.database)
     lines = (f"{a} {b}\n" for i, a in enumerate(names) for b in names[i + 1 : i + 6])
     project.pairs.write_text("".join(lines))
-    interrupted(stage, "reconstruct", "--db", project.database)
+    arguments = ("reconstruct", "--db", project.database, "--matcher", matcher)
+    interrupted(stage, *arguments)
     assert_no_leftovers(project.folder)
     assert not project.sparse.exists()
-    result = run("reconstruct", "--db", project.database)
+    result = run(*arguments)
     assert result.exit_code == 0, result.output
     assert "12 of 12" in result.stdout
 

@@ -18,8 +18,10 @@ from hypothesis import strategies as st
 from colmap_netvlad.colmap import engine
 from colmap_netvlad.colmap.copies import copy_matches
 from colmap_netvlad.colmap.database import image_names, open_database, pair_id
-from colmap_netvlad.matching import run as matching
-from colmap_netvlad.matching.run import MatchOptions, match_pairs
+from colmap_netvlad.matching import colmap as matching
+from colmap_netvlad.matching import run as asked_pairs
+from colmap_netvlad.matching.options import MatchOptions
+from colmap_netvlad.matching.run import match_pairs
 from colmap_netvlad.project import Project
 from colmap_netvlad.runtime import workers
 from colmap_netvlad.runtime.errors import InputError
@@ -223,7 +225,7 @@ def test_one_image_without_features_fails_its_pairs_only(project_copy: MakeProje
 @given(st.sets(st.tuples(st.integers(1, 90), st.integers(1, 90)), min_size=1, max_size=300))
 def test_the_order_of_matching_keeps_every_pair_once(pairs: set[tuple[int, int]]) -> None:
     asked = sorted({(min(pair), max(pair)) for pair in pairs if pair[0] != pair[1]} | {(1, 2)})
-    assert sorted(matching._in_tiles(asked)) == asked
+    assert sorted(asked_pairs.in_tiles(asked)) == asked
 
 
 def test_neighbours_in_the_list_share_images() -> None:
@@ -235,4 +237,4 @@ def test_neighbours_in_the_list_share_images() -> None:
         chunks = [order[at : at + 100] for at in range(0, len(order), 100)]
         return sum(len({image for pair in chunk for image in pair}) for chunk in chunks)
 
-    assert indexed(matching._in_tiles(pairs)) < 0.5 * indexed(pairs)
+    assert indexed(asked_pairs.in_tiles(pairs)) < 0.5 * indexed(pairs)

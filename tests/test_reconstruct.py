@@ -27,7 +27,7 @@ from colmap_netvlad.commands.reconstruct import (
 from colmap_netvlad.mapping.incremental import map_incremental
 from colmap_netvlad.mapping.output import free_output
 from colmap_netvlad.mapping.summary import ModelSummary, combine, registered_names, summarize
-from colmap_netvlad.matching.run import MatchReport
+from colmap_netvlad.matching.options import MatchReport
 from colmap_netvlad.project import Project
 from colmap_netvlad.runtime.errors import InputError
 from colmap_netvlad.terminal import models_table

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,8 @@ from colmap_netvlad.mapping.extend import extend_model, largest_model, read_mode
 from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.mapping.output import free_output
 from colmap_netvlad.mapping.summary import ModelSummary, registered_names, summarize
-from colmap_netvlad.matching.run import MatchOptions, MatchReport, match_pairs
+from colmap_netvlad.matching.options import MatchOptions, MatchReport, given_up_words
+from colmap_netvlad.matching.run import match_pairs
 from colmap_netvlad.photos.files import find_photos
 from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval.options import RetrievalOptions
@@ -36,6 +37,7 @@ class AddOptions:
         features: how the new photos are imported.
         seed: of matching and mapping.
         command: the command line that asked for it, for the quality report.
+        matching: who matches; its seed is set from here.
     """
 
     method: str = "hybrid"
@@ -44,6 +46,7 @@ class AddOptions:
     features: FeatureOptions = field(default_factory=FeatureOptions)
     seed: int = 0
     command: str = ""
+    matching: MatchOptions = field(default_factory=MatchOptions)
 
 
 @dataclass(frozen=True)
@@ -113,7 +116,7 @@ def add_photos(
     pairs = _pairs_of_new(project, set(usable), options)
     seconds["retrieval"] = time.monotonic() - start
 
-    matches = match_pairs(project.database, pairs, MatchOptions(seed=options.seed))
+    matches = match_pairs(project.database, pairs, replace(options.matching, seed=options.seed))
     seconds["matching"] = matches.seconds
 
     start = time.monotonic()
@@ -152,7 +155,8 @@ def add_lines(report: AddReport) -> list[str]:
         f"{report.before.points:,} -> {report.after.points:,} points, reprojection error "
         f"{report.before.mean_reprojection_error:.3f} -> "
         f"{report.after.mean_reprojection_error:.3f} px).",
-        f"Pairs: {report.matches.matched:,} matched, {report.matches.verified:,} verified.",
+        f"Pairs: {report.matches.matched:,} matched, {report.matches.verified:,} verified"
+        f"{given_up_words(report.matches)}.",
         "Minutes: "
         + ", ".join(f"{stage} {time / 60:.1f}" for stage, time in report.seconds.items())
         + ".",

@@ -304,6 +304,7 @@ def _matched_database(folder: SceneFolder, database: Path, options: AnnotateOpti
         copy_database(given, database, matches=True)
         return "given"
     from colmap_netvlad.colmap.features import extract_features
+    from colmap_netvlad.matching.options import MatchOptions
     from colmap_netvlad.matching.run import match_pairs
     from colmap_netvlad.pairs.union import union_of_top
     from colmap_netvlad.project import Project
@@ -312,7 +313,9 @@ def _matched_database(folder: SceneFolder, database: Path, options: AnnotateOpti
     extract_features(folder.images, database)
     ranking = rank_project(Project(database, folder.images), options.method, options.retrieval)
     pairs = union_of_top(ranking, options.retrieval.k)
-    match_pairs(database, [(pair.name1, pair.name2) for pair in pairs])
+    # What is learnt from is COLMAP's, whatever matches by default.
+    colmap = MatchOptions(matcher="colmap")
+    match_pairs(database, [(pair.name1, pair.name2) for pair in pairs], colmap)
     return options.method
 
 

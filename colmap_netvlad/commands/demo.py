@@ -25,7 +25,7 @@ from colmap_netvlad.demo.render import (
     render_flight,
 )
 from colmap_netvlad.mapping.options import MappingOptions
-from colmap_netvlad.matching.run import MatchOptions
+from colmap_netvlad.matching.options import MatchOptions
 from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval.options import RetrievalOptions
 from colmap_netvlad.runtime.errors import InputError

@@ -12,13 +12,14 @@ from colmap_netvlad.colmap.database import image_names, open_database
 from colmap_netvlad.commands.pairs import PairsReport
 from colmap_netvlad.graph.pair import Pair
 from colmap_netvlad.graph.verified import verified_components
+from colmap_netvlad.matching.options import MatchOptions, MatchReport, given_up_words
 from colmap_netvlad.matching.rounds import (
     RoundsReport,
     match_in_rounds,
     plan_budget,
     rounds_lines,
 )
-from colmap_netvlad.matching.run import MatchOptions, MatchReport, match_pairs
+from colmap_netvlad.matching.run import match_pairs
 from colmap_netvlad.pairs.connect import apart_lines
 from colmap_netvlad.pairs.lists import read_pairs
 from colmap_netvlad.project import Project
@@ -112,7 +113,7 @@ def report_lines(report: MatchingReport) -> list[str]:
     return [
         *(rounds_lines(report.rounds) if report.rounds else []),
         f"Pairs: {matches.requested:,} ({matches.already:,} matched before, "
-        f"{matches.matched:,} now), {matches.verified:,} verified, "
+        f"{matches.matched:,} now), {matches.verified:,} verified{given_up_words(matches)}, "
         f"{matches.seconds / 60:.1f} minutes.",
         *view_graph_lines(report.components),
     ]

@@ -29,8 +29,8 @@ from colmap_netvlad.mapping import MAPPERS
 from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.mapping.output import free_output
 from colmap_netvlad.mapping.summary import ModelSummary, combine, registered_names, summarize
+from colmap_netvlad.matching.options import MatchOptions, given_up_words
 from colmap_netvlad.matching.rounds import rounds_lines
-from colmap_netvlad.matching.run import MatchOptions
 from colmap_netvlad.project import Project
 from colmap_netvlad.runtime.errors import InputError
 from colmap_netvlad.runtime.sequences import listed
@@ -189,7 +189,7 @@ def report_lines(report: ReconstructReport) -> list[str]:
     lines = [
         *(rounds_lines(matching.rounds) if matching.rounds else []),
         f"Pairs: {matches.requested:,} ({matches.already:,} matched before, "
-        f"{matches.matched:,} now), {matches.verified:,} verified.",
+        f"{matches.matched:,} now), {matches.verified:,} verified{given_up_words(matches)}.",
         "Minutes: "
         + ", ".join(f"{stage} {time / 60:.1f}" for stage, time in report.seconds.items())
         + f", together {sum(report.seconds.values()) / 60:.1f}.",

@@ -18,7 +18,8 @@ from colmap_netvlad.colmap.database import open_database
 from colmap_netvlad.graph.components import components
 from colmap_netvlad.graph.pair import IndexPair
 from colmap_netvlad.graph.verified import CORRECT_MATCHES
-from colmap_netvlad.matching.run import MatchOptions, MatchReport, match_pairs
+from colmap_netvlad.matching.options import MATCHER_DEFAULT, MatchOptions, MatchReport
+from colmap_netvlad.matching.run import match_pairs
 from colmap_netvlad.pairs.connect import connecting_budget, connecting_pairs
 from colmap_netvlad.pairs.rounds import FITTED, next_round, split_budget
 from colmap_netvlad.project import Project
@@ -38,6 +39,7 @@ class RoundReport:
         pairs: pairs chosen.
         correct: those with more than `CORRECT_MATCHES` verified matches.
         seconds_choosing, seconds_matching: what choosing and matching them took, s.
+        given_up: pairs given up now at a first glance, see `MatchReport`.
     """
 
     title: str
@@ -45,6 +47,7 @@ class RoundReport:
     correct: int
     seconds_choosing: float
     seconds_matching: float
+    given_up: int = 0
 
 
 @dataclass(frozen=True)
@@ -170,6 +173,8 @@ class _Run:
     matching: MatchOptions
     ids: dict[str, int]
     plan: _Plan
+    matcher: str = MATCHER_DEFAULT
+    even_seconds: float = 0.0
 
     def spend(self) -> RoundsReport:
         similarity = similarity_matrix(self.ranking)
@@ -218,10 +223,14 @@ class _Run:
     def _match(self, chosen: Sequence[IndexPair], title: str, choosing: float) -> RoundReport:
         names = self.ranking.names
         pairs = [(names[i], names[j]) for i, j in chosen]
-        seconds = match_pairs(self.project.database, pairs, self.matching).seconds if pairs else 0.0
+        seconds, given_up = 0.0, 0
+        if pairs:
+            report = match_pairs(self.project.database, pairs, self.matching)
+            seconds, given_up, self.matcher = report.seconds, report.given_up, report.matcher
+            self.even_seconds += report.even_seconds
         verified = self._verified()
         correct = sum(verified.get(pair, 0) > CORRECT_MATCHES for pair in chosen)
-        return RoundReport(title, len(chosen), correct, choosing, seconds)
+        return RoundReport(title, len(chosen), correct, choosing, seconds, given_up)
 
     def _verified(self) -> dict[IndexPair, int]:
         """Return the verified matches of every matched pair, by indices into the names."""
@@ -243,6 +252,9 @@ class _Run:
             matched=len(chosen),
             verified=sum(verified.get(pair, 0) > 0 for pair in chosen),
             seconds=sum(r.seconds_choosing + r.seconds_matching for r in reports),
+            given_up=sum(r.given_up for r in reports),
+            matcher=self.matcher,
+            even_seconds=self.even_seconds,
         )
         return RoundsReport(matches, reports, self.budget)
 

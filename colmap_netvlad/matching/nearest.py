@@ -1,0 +1,120 @@
+"""Nearest descriptors: best and second best of a few against many, as small exact products.
+
+Products of bytes are whole numbers below 2^24, which float32 holds too: whichever of the two the
+processor multiplies faster, the result is the same bit for bit.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+BLOCK = 128
+"""Rows of a product: with 8,192 columns of 4 bytes it stays in the processor's cache."""
+
+NORM = 1 / 512**2
+"""Of the products of two descriptors."""
+
+LOWER = 128
+"""What codes are less than descriptors."""
+
+NONE = np.iinfo(np.int32).min
+"""Below all products."""
+
+TRIED = 2048
+"""Columns of the product that tells whether bytes or floats are faster."""
+
+MAX_ANGLE = 0.7
+MAX_RATIO = 0.8
+"""COLMAP's: largest angle (rad) between descriptors that match, and largest ratio to that of the
+second best."""
+
+
+@dataclass(frozen=True, eq=False)
+class Nearest:
+    """Neighbours of M queries.
+
+    Attributes:
+        best: (M,) index of the nearest; -1 where there is none.
+        angle: (M,) to the nearest, rad.
+        ratio: (M,) of that to the angle to the second nearest; 0 where there is only one.
+    """
+
+    best: NDArray[np.intp]
+    angle: NDArray[np.float32]
+    ratio: NDArray[np.float32]
+
+    def distinct(self, max_ratio: float) -> NDArray[np.bool_]:
+        """Return (M,) whether the nearest is near and the second nearest is not."""
+        return (self.best >= 0) & (self.angle <= MAX_ANGLE) & (self.ratio < max_ratio)
+
+
+def nearest(queries: NDArray[np.int8], codes: NDArray[np.int8]) -> Nearest:
+    """Return the nearest of (N, 128) codes to each of (M, 128) queries."""
+    count = len(queries)
+    best = np.full(count, -1, np.intp)
+    first, second = np.zeros((2, count), np.int32)
+    if len(codes):
+        kind = bytes_or_floats()
+        transposed = torch.from_numpy(codes).to(kind).T
+        shift = _shift(codes).astype(np.int32 if kind == torch.int8 else np.float32)
+        for start in range(0, count, BLOCK):
+            part = slice(start, start + BLOCK)
+            products = _products(torch.from_numpy(queries[part]).to(kind), transposed)
+            np.add(products, shift, out=products)
+            rows = np.arange(len(products))
+            best[part] = products.argmax(axis=1)
+            first[part] = products[rows, best[part]]
+            products[rows, best[part]] = NONE
+            second[part] = products[rows, products.argmax(axis=1)]
+        rest = _shift(queries) + LOWER**2 * queries.shape[1]
+        first += rest
+        second = np.where(second == NONE, 0, second + rest)
+    angle, other = _angle(first), _angle(second)
+    ratio = (angle / np.maximum(other, 1e-6)).astype(np.float32)
+    return Nearest(best, angle, ratio)
+
+
+@cache
+def bytes_or_floats() -> torch.dtype:
+    """Return what this machine multiplies faster: `torch.int8` or `torch.float32`.
+
+    Processors with instructions for products of bytes (AVX512-VNNI, AVX-VNNI, AMX) do these
+    faster; others, and some builds of torch, much slower, or have no such product.
+    """
+    if not hasattr(torch, "_int_mm"):
+        return torch.float32
+    return min((torch.int8, torch.float32), key=_seconds)
+
+
+def _seconds(kind: torch.dtype) -> float:
+    """Return the shortest time of a few products; infinite where they cannot be made."""
+    codes = (torch.arange(TRIED * 128) % 251 - 125).reshape(TRIED, 128).to(kind)
+    times = []
+    for _ in range(5):
+        start = time.perf_counter()
+        try:
+            _products(codes[:BLOCK], codes.T)
+        except (RuntimeError, NotImplementedError):
+            return float("inf")
+        times.append(time.perf_counter() - start)
+    return min(times)
+
+
+def _products(a: torch.Tensor, b: torch.Tensor) -> NDArray[np.int32] | NDArray[np.float32]:
+    """Return (M, N) the products of rows and columns, of bytes as int32."""
+    return (torch._int_mm(a, b) if a.dtype == torch.int8 else a @ b).numpy()
+
+
+def _shift(codes: NDArray[np.int8]) -> NDArray[np.int32]:
+    """Return (N,) the part of (a + `LOWER`)(b + `LOWER`) that depends on one code alone."""
+    return LOWER * codes.sum(axis=1, dtype=np.int32)
+
+
+def _angle(products: NDArray[np.int32]) -> NDArray[np.float32]:
+    return np.arccos(np.minimum(products * NORM, 1)).astype(np.float32)
