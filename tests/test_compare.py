@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
+import json
 import shutil
 import sqlite3
 from collections.abc import Callable
@@ -22,6 +24,8 @@ from colmap_netvlad.comparison.workspace import Workspace, file_name, open_works
 from colmap_netvlad.flight import open_flight
 from colmap_netvlad.graph.verified import correct_pairs, verified_by_name
 from colmap_netvlad.mapping.options import MappingOptions
+from colmap_netvlad.matching.options import MatchOptions
+from colmap_netvlad.matching.run import match_pairs
 from colmap_netvlad.project import Project
 from colmap_netvlad.runtime.errors import EXIT_PARTIAL, InputError
 
@@ -317,6 +321,64 @@ def test_a_folder_of_another_project_is_refused(no_page, project_copy: Make):
         connection.execute("UPDATE images SET name = 'renamed.jpg' WHERE image_id = 1")
     with pytest.raises(InputError, match="another project"):
         compare(other, ["random"], replace(FAST, output=one.folder / "project-compare"))
+
+
+GUIDED = replace(FAST, matching=MatchOptions("guided"))
+
+
+def test_one_comparison_has_one_matcher_and_says_which(project_copy: Make):
+    project = project_copy()
+    comparison, workspace = compare(project, ["vlad"], GUIDED)
+    assert comparison.matcher == read_json(workspace.json).matcher == "guided"
+    assert "matched by the matcher guided" in workspace.html.read_text()
+    assert compare(project, ["random"], FAST)[0].matcher == "guided"  # none named: the folder's
+    for other in (MatchOptions("colmap"), MatchOptions("guided", thorough=True)):
+        with pytest.raises(InputError, match=r"matched by guided, not by .*`output`"):
+            compare(project, ["vlad"], replace(FAST, matching=other))
+
+
+def test_the_truth_is_colmaps(project_copy: Make, monkeypatch):
+    project = project_copy()
+    with pytest.raises(InputError, match="exhaustive is the truth"):
+        compare(project, ["vlad", "exhaustive"], GUIDED)
+    compare(project, ["vlad"], GUIDED)
+    with pytest.raises(InputError, match="exhaustive is the truth"):
+        compare(project, ["exhaustive"], FAST)
+    monkeypatch.setattr(pipeline, "MATCHER_DEFAULT", "guided")
+    assert compare(project_copy(name="truth"), ["exhaustive"], FAST)[0].matcher == "colmap"
+    assert compare(project_copy(name="other"), ["random"], FAST)[0].matcher == "guided"
+
+
+def test_a_comparison_made_before_there_were_matchers_is_colmaps(project_copy: Make):
+    project = project_copy()
+    _, workspace = compare(project, ["random"], FAST)
+    content = json.loads(workspace.project.read_text())
+    del content["matcher"]
+    workspace.project.write_text(json.dumps(content))
+    with pytest.raises(InputError, match="matched by colmap, not by guided"):
+        compare(project, ["random"], GUIDED)
+
+
+def test_few_pairs_are_charged_as_if_they_were_among_many(project_copy: Make, monkeypatch):
+    """Three processors, one of which matches: a pair takes a third of what that one needed."""
+    project = project_copy()
+    with open_flight(project) as flight:
+        workspace = open_workspace(project.folder / "compare", flight)
+    pairs = list(itertools.combinations(flight.names, 2))[:7]
+    reports = []
+
+    def matched(*arguments):
+        reports.append(match_pairs(*arguments))
+        return reports[-1]
+
+    monkeypatch.setattr(pool, "match_pairs", matched)
+    monkeypatch.setattr(pool, "CHUNK", 1)
+    pool.match_once(workspace, {"one": pairs}, MatchOptions(processes=3))
+    assert [report.matched for report in reports] == [3, 3, 1]
+    for report in reports:
+        assert report.even_seconds == pytest.approx(report.seconds / 3, rel=0.3)
+    total = sum(report.even_seconds for report in reports)
+    assert sum(workspace.pair_seconds().values()) == pytest.approx(total)
 
 
 def test_a_folder_with_other_things_is_left_alone(project_copy: Make, tmp_path):

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from colmap_netvlad import metrics
+from colmap_netvlad.colmap.database import open_database
 from colmap_netvlad.comparison import pool
 from colmap_netvlad.comparison.evidence import Evidence
 from colmap_netvlad.comparison.figures import (
@@ -18,12 +19,13 @@ from colmap_netvlad.comparison.figures import (
     gather_evidence,
 )
 from colmap_netvlad.comparison.models import kept_figures, reconstruct_once
-from colmap_netvlad.comparison.result import Comparison, ModelFigures, write_json
+from colmap_netvlad.comparison.result import EXHAUSTIVE, Comparison, ModelFigures, write_json
 from colmap_netvlad.comparison.workspace import Workspace, check_comparable, open_workspace
 from colmap_netvlad.flight import Flight, open_flight
 from colmap_netvlad.graph.pair import Pair, as_pair
 from colmap_netvlad.mapping.options import MappingOptions
-from colmap_netvlad.matching.run import MatchOptions
+from colmap_netvlad.matching.matchers import usable_matcher
+from colmap_netvlad.matching.options import MATCHER_DEFAULT, MatchOptions
 from colmap_netvlad.pairs.union import union_of_top
 from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval.methods import deep, find_method
@@ -55,7 +57,9 @@ class CompareOptions:
             largest.
         retrieval: device, vocabulary tree; its k and seed are set from here.
         seed: of every method, of verification and of mapping.
-        matching, mapping: their other options.
+        matching: who matches all pairs; where no matcher is named the folder's, COLMAP's with the
+            method exhaustive, else the default.
+        mapping: its other options.
     """
 
     k: tuple[int, ...] = (30,)
@@ -127,8 +131,8 @@ def _compare(
     ks = _checked_ks(options, len(flight.names))
     folder = options.output or project.folder / f"{project.database.stem}-compare"
     workspace = open_workspace(folder, flight)
+    matching = _matching(flight, workspace, texts, options)
     candidates = _candidates(workspace.add_methods(texts))
-    matching = replace(options.matching, seed=options.seed)
     if any(not candidate.ranks for candidate in candidates):
         _check_cost(workspace, flight, matching, confirm)
     for candidate in candidates:
@@ -166,6 +170,38 @@ def _checked_ks(options: CompareOptions, images: int) -> tuple[int, ...]:
             f"`reconstruct_k` is {wanted}, which is not one of `k`: {', '.join(map(str, ks))}."
         )
     return ks
+
+
+def _matching(
+    flight: Flight, workspace: Workspace, texts: Sequence[str], options: CompareOptions
+) -> MatchOptions:
+    """Return how all pairs of this comparison are matched: by one matcher, the truth by COLMAP's.
+
+    Raises:
+        InputError: another matcher than the folder's, or than COLMAP's with all pairs.
+    """
+    exhaustive = EXHAUSTIVE in (*workspace.methods(), *texts)
+    kept = workspace.matcher()
+    matching = replace(options.matching, seed=options.seed)
+    if matching.matcher is None and not matching.thorough:
+        matching = matching.labelled(kept or ("colmap" if exhaustive else MATCHER_DEFAULT))
+    with open_database(flight.project.database) as opened:
+        matcher, note = usable_matcher(matching, opened.has_sift())
+    if note:
+        logger.warning(note)
+        matching = replace(matching, matcher=matcher.name, thorough=False)
+    if kept is not None and matching.label != kept:
+        raise InputError(
+            f"The pairs in {workspace.folder} were matched by {kept}, not by {matching.label}, and "
+            "one comparison has one matcher; name another folder with `output`."
+        )
+    if exhaustive and matching.label != "colmap":
+        raise InputError(
+            f"The method {EXHAUSTIVE} is the truth, which COLMAP's own matcher tells; compare it "
+            f"with `matcher` colmap, or leave it out in another folder (`output`)."
+        )
+    workspace.keep_matcher(matching.label)
+    return matching
 
 
 def _stable_text(text: str) -> str:

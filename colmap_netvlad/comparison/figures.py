@@ -28,6 +28,7 @@ from colmap_netvlad.comparison.workspace import Workspace
 from colmap_netvlad.flight import Flight
 from colmap_netvlad.graph.pair import Pair
 from colmap_netvlad.graph.verified import correct_pairs, verified_by_name
+from colmap_netvlad.matching.options import MATCHER_DEFAULT
 from colmap_netvlad.runtime.machine import usable_processors
 from colmap_netvlad.runtime.version import VERSION
 
@@ -144,6 +145,7 @@ def compute_figures(
         seconds_matched=pool.seconds_of(set().union(*widest.values()), seconds)[0] or 0.0,
         versions=_versions(),
         methods=tuple(methods),
+        matcher=workspace.matcher() or MATCHER_DEFAULT,
     )
 
 

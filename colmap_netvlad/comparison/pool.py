@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import math
 import random
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 
 from colmap_netvlad.colmap.database import open_database
 from colmap_netvlad.comparison.workspace import Workspace
 from colmap_netvlad.graph.pair import Pair, as_pair
-from colmap_netvlad.matching.run import MatchOptions, match_pairs
+from colmap_netvlad.matching.options import MatchOptions
+from colmap_netvlad.matching.run import match_pairs
 from colmap_netvlad.runtime import progress
+from colmap_netvlad.runtime.machine import usable_processors
+from colmap_netvlad.runtime.sequences import blocks
 
 CHUNK = 256
-"""Pairs whose matching is timed together."""
+"""Pairs for each processor whose matching is timed together."""
 
 SAMPLE = 24
 """Pairs on which the cost of exhaustive matching is measured."""
@@ -43,7 +46,7 @@ def match_once(
         groups.setdefault(tuple(askers[pair]), []).append(pair)
     with progress.step("Matching distinct pairs", len(askers)) as bar:
         for methods in sorted(groups):
-            for chunk in _chunks(groups[methods]):
+            for chunk in _chunks(groups[methods], options):
                 _match_timed(workspace, chunk, options)
                 bar.advance(len(chunk))
     return len(askers)
@@ -89,9 +92,11 @@ def measure_cost(workspace: Workspace, names: Sequence[str], options: MatchOptio
 
 
 def _match_timed(workspace: Workspace, pairs: Sequence[Pair], options: MatchOptions) -> None:
+    # Of a few pairs, for which one process works, as if they had been among many.
     report = match_pairs(workspace.union, pairs, options)
-    workspace.add_seconds(pairs, report.seconds)
+    workspace.add_seconds(pairs, report.even_seconds)
 
 
-def _chunks(pairs: Sequence[Pair]) -> list[Sequence[Pair]]:
-    return [pairs[at : at + CHUNK] for at in range(0, len(pairs), CHUNK)]
+def _chunks(pairs: Sequence[Pair], options: MatchOptions) -> Iterator[Sequence[Pair]]:
+    size = CHUNK * (options.processes or usable_processors())
+    return (pairs[part] for part in blocks(len(pairs), size))

@@ -87,7 +87,8 @@ class MethodResult:
         seconds_describe, seconds_search: T_fe and T_nns of eq. 20, s; None where it failed.
         timed_earlier: a time was measured in an earlier run, whose descriptors were reused.
         seconds_match: matching and verifying this method's own pairs at the largest k, s: the
-            sum of what each of them took when it was matched for all methods.
+            sum of what each of them took when it was matched for all methods, all processors
+            at work.
         match_measured: share of these pairs whose time was measured, 0..1; the others (their
             run was killed before it could write the time down) count as the mean of the rest.
         mean_average_precision: of its lists down to `Comparison.precision_depth`, 0..1; None for
@@ -145,6 +146,8 @@ class Comparison:
         pairs_matched: distinct pairs of all methods, each matched once.
         pairs_requested: the sum of all methods' pairs, matched one by one without sharing.
         seconds_matched: what matching the distinct pairs took, s.
+        matcher: who matched all pairs, the reference's too: a name in `matchers.MATCHERS`, and
+            whether thoroughly.
         versions: of the programs that the figures depend on, and the processor.
         methods: in the order they were asked for.
     """
@@ -163,6 +166,7 @@ class Comparison:
     seconds_matched: float
     versions: dict[str, str] = field(default_factory=dict)
     methods: tuple[MethodResult, ...] = ()
+    matcher: str = "colmap"
 
     @property
     def k(self) -> int:

@@ -1,7 +1,7 @@
 """The folder of a comparison: what is kept there so that a killed run goes on where it stopped.
 
 compare.html, compare.json, compare.csv   the result
-work/project.json     which project this is: a fingerprint of image names and features
+work/project.json     which project this is: a fingerprint of image names and features; who matches
 work/methods.json     the methods asked for so far
 work/union.db         the project's features, and every distinct pair matched once
 work/seconds.db       what matching each pair took
@@ -106,6 +106,21 @@ class Workspace:
         methods = list(dict.fromkeys([*self.methods(), *names]))
         write_atomically(self._work / "methods.json", json.dumps(methods, ensure_ascii=False))
         return methods
+
+    # Who matches
+
+    def matcher(self) -> str | None:
+        """Return the label (`MatchOptions`) of the matcher of all pairs, None before the first."""
+        content = json.loads(self.project.read_text(encoding="utf-8"))
+        first = "colmap" if self.methods() else None  # the only one there was
+        matcher: str | None = content.get("matcher", first)
+        return matcher
+
+    def keep_matcher(self, label: str) -> None:
+        """Write down who matches all pairs."""
+        content = json.loads(self.project.read_text(encoding="utf-8"))
+        text = json.dumps({**content, "matcher": label}, indent=1)
+        write_atomically(self.project, text + "\n")
 
     # Rankings
 
