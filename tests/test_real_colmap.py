@@ -28,7 +28,7 @@ from test_pairs_command import sha256
 from colmap_netvlad.cli import cli
 from colmap_netvlad.colmap.database import image_names, open_database
 from colmap_netvlad.demo.check import check_against_truth
-from colmap_netvlad.demo.render import Flight
+from colmap_netvlad.demo.render import RenderedFlight
 from colmap_netvlad.pairs.lists import read_pairs
 from colmap_netvlad.project import Project
 
@@ -119,13 +119,13 @@ def matched_names(path: Path) -> set[frozenset[str]]:
         return {frozenset((names[a], names[b])) for a, b in database.matched_pairs()}
 
 
-def assert_whole_and_true(model: Path, flight: Flight) -> None:
+def assert_whole_and_true(model: Path, flight: RenderedFlight) -> None:
     check = check_against_truth([pycolmap.Reconstruction(model)], flight)
     assert check.passed, f"{check.registered} registered, off by {check.largest:.2%}"
 
 
 @pytest.fixture
-def extracted(flight: Flight, shared_folder: Path, tmp_path: Path) -> Project:
+def extracted(flight: RenderedFlight, shared_folder: Path, tmp_path: Path) -> Project:
     """A project of the test's own whose features COLMAP's program extracted."""
 
     def make(folder: Path) -> None:
@@ -145,7 +145,7 @@ def extracted(flight: Flight, shared_folder: Path, tmp_path: Path) -> Project:
 
 @needs_colmap
 def test_ours_and_colmaps_models_of_colmaps_features_agree(
-    extracted: Project, flight: Flight, tmp_path: Path
+    extracted: Project, flight: RenderedFlight, tmp_path: Path
 ) -> None:
     before = sha256(extracted.database)
     ours("pairs", "--db", extracted.database, "--images", extracted.images, "--k", 6)
@@ -175,7 +175,7 @@ def test_ours_and_colmaps_models_of_colmaps_features_agree(
 
 @needs_colmap
 def test_colmap_4_works_on_in_a_database_that_we_made_and_older_ones_refuse_it(
-    project_copy: Callable[..., Project], flight: Flight, tmp_path: Path
+    project_copy: Callable[..., Project], flight: RenderedFlight, tmp_path: Path
 ) -> None:
     """README says so: with COLMAP 3 let its own `feature_extractor` make the database.
 

@@ -102,7 +102,7 @@ def _reason(
     if not verified:
         return NO_VERIFIED_PAIR, (
             f"Matched with {tried:,} photos, at most {most:,} verified matches with any "
-            f"(more than {CORRECT_MATCHES} are needed). More partners (--k) or --rounds may help."
+            f"(more than {CORRECT_MATCHES} are needed). More partners (`k`) or `rounds` may help."
         )
     if not into_model:
         return APART, (
