@@ -31,6 +31,7 @@ from colmap_netvlad.cli_options import (
     masks_option,
     matcher_options,
     matching_options,
+    method_option,
     model_database_option,
     output_option,
     place_options,
@@ -275,15 +276,15 @@ def match(
 @verbose_option
 def reconstruct(
     project: Project,
+    pairs: Path | None,
+    rounds: RoundsOptions | None,
+    matching: MatchOptions,
     output: Path | None,
     mapper: str,
     mapping: MappingOptions,
     drop_contradicted: bool,
     world: WorldOptions,
     gcp: ControlFile | None,
-    pairs: Path | None,
-    rounds: RoundsOptions | None,
-    matching: MatchOptions,
     as_json: bool,
 ) -> None:
     """Match the pairs, verify them, and build the sparse model.
@@ -329,12 +330,7 @@ def reconstruct(
 )
 @click.option("--among-new", is_flag=True, help="Pair the new photos with each other as well.")
 @k_option
-@click.option(
-    "--method",
-    default="hybrid",
-    show_default=True,
-    help="Retrieval method; `colmap-netvlad methods` lists them.",
-)
+@method_option
 @retrieval_options
 @matcher_options
 @feature_options
@@ -503,12 +499,7 @@ def export(
     show_default=True,
     help="Partners in other models that each image is matched with.",
 )
-@click.option(
-    "--method",
-    default="hybrid",
-    show_default=True,
-    help="Retrieval method; `colmap-netvlad methods` lists them.",
-)
+@method_option
 @retrieval_options
 @verbose_option
 def merge(

@@ -53,6 +53,12 @@ output_option = functools.partial(click.option, "--output", "--output_path", "ou
 k_option = click.option(
     "--k", default=30, show_default=True, help="Partners retrieved for each image."
 )
+method_option = click.option(
+    "--method",
+    default="hybrid",
+    show_default=True,
+    help="Retrieval method; `colmap-netvlad methods` lists them.",
+)
 seed_option = click.option(
     "--seed", default=0, show_default=True, help="Seed of every random choice."
 )

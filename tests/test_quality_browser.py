@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 from models import grid_model
+from pages import watched_page
 from test_report_browser import browser
 
 from colmap_netvlad.report.flight_page import render_flight_page
@@ -31,17 +32,9 @@ def address(tmp_path_factory) -> str:
 
 @pytest.fixture(params=[1280, 400], ids=["desktop", "telephone"])
 def opened(browser, address, request):
-    page = browser.new_page(viewport={"width": request.param, "height": 900})
-    faults, requests = [], []
-    page.on("console", lambda message: faults.append(message.text))
-    page.on("pageerror", lambda fault: faults.append(str(fault)))
-    page.on("request", lambda asked: requests.append(asked.url))
-    page.goto(address)
-    yield page
-    assert faults == []
-    assert [url for url in requests if not url.startswith("data:")] == [address]
-    assert page.title().startswith("Quality report of <script>")
-    page.close()
+    with watched_page(browser, address, request.param) as page:
+        yield page
+        assert page.title().startswith("Quality report of <script>")
 
 
 def rows(page) -> list[str]:

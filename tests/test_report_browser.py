@@ -6,6 +6,7 @@ import shutil
 
 import pytest
 from comparisons import made_up
+from pages import watched_page
 
 from colmap_netvlad.report.page import render_page
 
@@ -40,16 +41,8 @@ def address(flight, tmp_path_factory) -> str:
 
 @pytest.fixture(params=[1280, 400], ids=["desktop", "telephone"])
 def opened(browser, address, request):
-    page = browser.new_page(viewport={"width": request.param, "height": 900})
-    faults, requests = [], []
-    page.on("console", lambda message: faults.append(message.text))
-    page.on("pageerror", lambda fault: faults.append(str(fault)))
-    page.on("request", lambda asked: requests.append(asked.url))
-    page.goto(address)
-    yield page
-    assert faults == []
-    assert [url for url in requests if not url.startswith("data:")] == [address]
-    page.close()
+    with watched_page(browser, address, request.param) as page:
+        yield page
 
 
 def test_all_sections_are_shown(opened):

@@ -12,13 +12,13 @@ from importlib.resources import files
 from typing import Any
 
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from numpy.typing import NDArray
 
 from colmap_netvlad.graph.lookalikes import Lookalike
 from colmap_netvlad.report import flight_plots as plots
 from colmap_netvlad.report.numbers import count, seconds
+from colmap_netvlad.report.pages import pages
 from colmap_netvlad.report.quality import (
     ENOUGH,
     Check,
@@ -86,13 +86,7 @@ def render_flight_page(quality: Quality, checks: Sequence[Check]) -> str:
     What is drawn is capped, so that a flight of 5,000 photos gives a page of a few megabytes.
     Nothing in it runs but our own script, which the page's content policy names by its hash.
     """
-    environment = Environment(
-        loader=PackageLoader("colmap_netvlad.report"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+    environment = pages()
     environment.filters.update(count=count, duration=seconds, percent=percent, number=number)
     script = files("colmap_netvlad.report").joinpath("templates/flight.js").read_text("utf-8")
     missing = list(quality.missing or ())

@@ -107,7 +107,7 @@ def _reason(
     if not into_model:
         return APART, (
             f"Its {verified:,} verified pairs lead to photos that are missing too. "
-            "More partners (--k) or --rounds may join them."
+            "More partners (`k`) or `rounds` may join them."
         )
     if points < LEAST_POINTS:
         return TOO_FEW_POINTS, (

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import networkx as nx
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from numpy.typing import NDArray
 
@@ -28,6 +27,7 @@ from colmap_netvlad.report.measures import (
     shown,
 )
 from colmap_netvlad.report.numbers import count, percent, seconds
+from colmap_netvlad.report.pages import pages
 from colmap_netvlad.report.thumbnails import Thumbnails, data_uri
 
 
@@ -62,13 +62,7 @@ def render_page(comparison: Comparison, evidence: Evidence) -> str:
     """
     layout = lay_out(evidence)
     finds = single_finds(evidence)
-    environment = Environment(
-        loader=PackageLoader("colmap_netvlad.report"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+    environment = pages()
     environment.filters.update(count=count, percent=percent, duration=seconds)
     return environment.get_template("comparison.html").render(
         comparison=comparison,

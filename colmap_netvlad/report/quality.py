@@ -320,7 +320,7 @@ def _one_model(quality: Quality) -> Check | None:
     return Check(
         "Models", f"{len(others) + 1}", "yellow",
         f"The flight fell apart: photos also {listed}. Pairs between the parts are missing "
-        "(a larger --k, or --rounds).",
+        "(a larger `k`, or `rounds`).",
     )  # fmt: skip
 
 
