@@ -189,7 +189,8 @@ def test_each_missing_photo_has_its_reason(project_copy):
             connection.execute(f"DELETE FROM {table} WHERE {pairs.format(ids[names[1]])}")
         own = pairs.format(ids[names[2]])
         connection.execute(
-            f"UPDATE two_view_geometries SET rows = 3, data = substr(data, 1, 24) WHERE {own}"
+            f"UPDATE two_view_geometries SET rows = 3, data = substr(data, 1, 24)"
+            f" WHERE rows > 3 AND ({own})"
         )
         connection.commit()
 

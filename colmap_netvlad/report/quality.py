@@ -381,7 +381,7 @@ def _lookalikes(quality: Quality) -> Check | None:
     return Check(
         title, value, "yellow",
         "Verified pairs of what are probably different places; they can fold a model. Look at them "
-        "below; reconstruct --drop-contradicted leaves them out.",
+        "below; `drop_contradicted` of reconstruct leaves them out.",
     )  # fmt: skip
 
 
