@@ -242,7 +242,7 @@ def matched_project(mapped: Mapped, folder: Path) -> Path:
 
 def test_reconstruct_brings_the_model_into_the_world(mapped: Mapped, tmp_path: Path) -> None:
     database = matched_project(mapped, tmp_path)
-    result = run("reconstruct", "--db", database, "--mapper", "incremental")
+    result = run("reconstruct", "--db", database, "--mapper", "incremental", "--threads", 1)
     assert result.exit_code == 0, result.output
     assert "Georegistered in m east, north, up" in result.output
     assert np.sqrt((errors(tmp_path / "sparse/0", mapped.truth) ** 2).mean()) < NOISE

@@ -226,4 +226,4 @@ def test_pairs_of_hloc_are_matched(project_copy: Callable[..., Project]) -> None
     listed = [p for a, b in pairwise(names) for p in ((a, b), (b, a))]
     write_as_hloc(project.pairs, listed)
     printed = ours("match", "--db", project.database)
-    assert f"Pairs: {len(names) - 1} (0 matched before)" in printed
+    assert f"Pairs: {len(names) - 1} (0 matched before, {len(names) - 1} now)" in printed
