@@ -12,6 +12,7 @@ import pytest
 
 from colmap_netvlad.colmap.database import image_names, open_database
 from colmap_netvlad.colmap.features import FeatureOptions, extract_features
+from colmap_netvlad.commands import add
 from colmap_netvlad.commands.add import AddOptions, add_photos, newest_model
 from colmap_netvlad.demo.render import RenderedFlight
 from colmap_netvlad.mapping.incremental import map_incremental
@@ -113,4 +114,26 @@ def test_without_a_model_it_is_one_sentence(project_copy: Callable[..., Project]
     assert project.images is not None
     shutil.copy(project.images / "DJI_0001.JPG", project.images / "new.jpg")
     with pytest.raises(InputError, match="is not a COLMAP model"):
+        add_photos(project, newest_model(project), OPTIONS)
+
+
+def test_a_stopped_addition_goes_on_with_the_same_photos(
+    reconstructed: tuple[Project, list[Path]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    project, photos = reconstructed
+    assert project.images is not None
+    for photo in photos:
+        shutil.copy(photo, project.images / photo.name)
+
+    def stop(*arguments: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(add, "match_pairs", stop)  # the database has the new photos by then
+        with pytest.raises(KeyboardInterrupt):
+            add_photos(project, newest_model(project), OPTIONS)
+    report = add_photos(project, newest_model(project), OPTIONS)
+    assert report.new == sorted(photo.name for photo in photos)
+    assert report.after.registered == report.before.registered + NEW
+    with pytest.raises(InputError, match="There are no new photos"):
         add_photos(project, newest_model(project), OPTIONS)

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from colmap_netvlad.cache.ranking import NO_PARTNER, Ranking
+from colmap_netvlad.cache.store import Store
 from colmap_netvlad.colmap.database import image_names
 from colmap_netvlad.colmap.features import FeatureOptions, FeatureReport, extract_features
 from colmap_netvlad.commands.report import FlightReport, report_models, run_of
@@ -24,6 +27,9 @@ from colmap_netvlad.retrieval.options import RetrievalOptions
 from colmap_netvlad.retrieval.rank import rank_project
 from colmap_netvlad.runtime.errors import InputError
 from colmap_netvlad.runtime.sequences import listed
+
+UNFINISHED_SETTING = "adding"
+"""The cache's setting with the names of photos whose adding has begun, JSON."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +90,8 @@ def add_photos(
     """Import the photos the database does not have, and register them into a model.
 
     Features, descriptors, pairs, matches and poses are computed for the new photos alone; pairs
-    are between a new photo and an old one. The model given is left as it is.
+    are between a new photo and an old one. The model given is left as it is. Where it was stopped,
+    it goes on with the same photos.
 
     Args:
         project: its photo folder holds the new photos beside the old ones; its database gets
@@ -97,9 +104,11 @@ def add_photos(
     """
     model = model or newest_model(project)
     folder = project.need_images()
-    old = image_names(project.database)
+    unfinished = _unfinished(project)
+    old = tuple(name for name in image_names(project.database) if name not in unfinished)
     new = _new_photos(folder, old)
     before = read_model(model)
+    _remember_unfinished(project, new)
     seconds: dict[str, float] = {}
 
     start = time.monotonic()
@@ -133,6 +142,7 @@ def add_photos(
     run = run_of(options.command or "add, called from Python", seconds, asdict(options))
     quality = report_models(target, project.database, folder, run)
     registered = registered_names([after])
+    _remember_unfinished(project, [])
     return AddReport(
         new=usable,
         features=features,
@@ -189,6 +199,17 @@ def newest_model(project: Project) -> Path:
 def _number(name: str) -> int:
     suffix = name.rpartition("-")[2]
     return int(suffix) if suffix.isdigit() else 1
+
+
+def _unfinished(project: Project) -> set[str]:
+    """Return the photos whose adding was stopped: the database may have them, no model does."""
+    with Store(project.cache) as store:
+        return set(json.loads(store.setting(UNFINISHED_SETTING) or "[]"))
+
+
+def _remember_unfinished(project: Project, names: Sequence[str]) -> None:
+    with Store(project.cache) as store:
+        store.remember(UNFINISHED_SETTING, json.dumps(names))
 
 
 def _new_photos(folder: Path, old: tuple[str, ...]) -> list[str]:
