@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -45,6 +44,7 @@ from colmap_netvlad.matching.options import MatchOptions, given_up_words
 from colmap_netvlad.matching.rounds import rounds_lines
 from colmap_netvlad.project import Project
 from colmap_netvlad.runtime.errors import InputError
+from colmap_netvlad.runtime.files import scratch_folder
 from colmap_netvlad.runtime.sequences import listed
 
 
@@ -188,8 +188,8 @@ def mapping_database(project: Project, drop: bool) -> Iterator[tuple[Path, list[
         return
     left_out = set(dropped)
     kept = [pair for pair in verified_by_name(project.database) if pair not in left_out]
-    with tempfile.TemporaryDirectory(prefix=".lookalikes.", dir=project.folder) as folder:
-        copy = Path(folder) / project.database.name
+    with scratch_folder(project.folder) as folder:
+        copy = folder / project.database.name
         copy_with_pairs(project.database, copy, kept)
         yield copy, dropped
 

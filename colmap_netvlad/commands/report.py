@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from colmap_netvlad.colmap.database import open_database
 from colmap_netvlad.mapping.extend import largest_model, read_model
+from colmap_netvlad.photos.files import leaves_folder
 from colmap_netvlad.photos.positions import place, read_gps
 from colmap_netvlad.project import DATABASE_NAMES
 from colmap_netvlad.report.flight_page import render_flight_page
@@ -178,7 +179,8 @@ def find_positions(
     if images is not None and unknown:
         with progress.step("Reading GPS of photos", len(unknown)) as bar:
             for i in unknown:
-                found[i] = read_gps(images / listed[i])
+                if not leaves_folder(listed[i]):
+                    found[i] = read_gps(images / listed[i])
                 bar.advance()
     metres = place(found, listed).metres
     return {name: row for name, row in zip(listed, metres, strict=True) if np.isfinite(row).all()}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ from colmap_netvlad.colmap.database import InitialCamera
 from colmap_netvlad.colmap.engine import silence
 from colmap_netvlad.report.ground import Frame
 from colmap_netvlad.report.modeldata import ModelData
+from colmap_netvlad.runtime.files import scratch_folder
 
 Floats = NDArray[np.float64]
 
@@ -167,7 +167,7 @@ def _middle_part(model: pycolmap.Reconstruction, data: ModelData) -> pycolmap.Re
         if frame_id not in keep:
             part.deregister_frame(frame_id)
     # Written and read again, as COLMAP's covariance asks every frame for its pose.
-    with tempfile.TemporaryDirectory() as folder:
+    with scratch_folder() as folder:
         part.write(folder)
         return pycolmap.Reconstruction(folder)
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 
 from colmap_netvlad.photos.decode import decode_photo
-from colmap_netvlad.photos.files import BadPhoto
+from colmap_netvlad.photos.files import BadPhoto, photo_path
 
 LONG_SIDE = 208
 """Of a thumbnail, px: sharp on screens of twice the density at the size the page shows."""
@@ -39,7 +39,7 @@ class Thumbnails:
         if self._folder is None:
             return ""
         try:
-            pixels = decode_photo(self._folder / name, LONG_SIDE)
+            pixels = decode_photo(photo_path(self._folder, name), LONG_SIDE)
         except BadPhoto:
             return ""
         jpeg = cv2.imencode(

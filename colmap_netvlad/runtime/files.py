@@ -71,15 +71,18 @@ def temporary_prefix(path: Path) -> str:
 
 
 @contextmanager
-def scratch_folder() -> Iterator[Path]:
-    """Yield an empty folder on the system's temporary disk, which is gone after the block.
+def scratch_folder(place: Path | None = None) -> Iterator[Path]:
+    """Yield an empty folder in `place`, which is gone after the block.
 
     Those of processes that were killed go with the next one.
 
+    Args:
+        place: None: the system's temporary disk.
+
     Raises:
-        InputError: the temporary disk cannot be written.
+        InputError: `place` cannot be written.
     """
-    base = Path(tempfile.gettempdir()) / "colmap-netvlad"
+    base = Path(place or tempfile.gettempdir()) / "colmap-netvlad"
     try:
         folder = tempfile.mkdtemp(prefix=temporary_prefix(base), dir=base.parent)
     except OSError as fault:
