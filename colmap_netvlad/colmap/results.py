@@ -7,7 +7,6 @@ transaction: they are what its own matcher would have written, in every version 
 from __future__ import annotations
 
 import sqlite3
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +19,7 @@ from colmap_netvlad.colmap import engine
 from colmap_netvlad.colmap.copies import copy_matches
 from colmap_netvlad.colmap.database import Database, pair_id
 from colmap_netvlad.runtime.errors import InputError
+from colmap_netvlad.runtime.files import scratch_folder
 
 MIN_MATCHES = 15
 """Fewer matches than this COLMAP's matcher writes as none."""
@@ -73,7 +73,7 @@ def write_results(target: Path, results: Sequence[PairResult]) -> None:
         return
     engine.check_space(target.parent)
     try:
-        with tempfile.TemporaryDirectory(prefix="colmap-netvlad-") as folder:
+        with scratch_folder() as folder:
             beside = Path(folder, "results.db")
             _write(beside, results)
             copy_matches(beside, target, [pair_id(*result.pair) for result in results])

@@ -26,6 +26,7 @@ from colmap_netvlad.geo.places import Places, find_places
 from colmap_netvlad.mapping.output import free_output, model_folder
 from colmap_netvlad.project import DATABASE_NAMES
 from colmap_netvlad.runtime.errors import InputError
+from colmap_netvlad.runtime.files import temporary_prefix
 
 
 @dataclass(frozen=True)
@@ -181,7 +182,7 @@ def georegister_in_place(
     """
     placed = []
     for path in find_models(folder):
-        draft = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=folder))
+        draft = Path(tempfile.mkdtemp(prefix=temporary_prefix(path), dir=folder))
         try:
             one = place_model(
                 path.name, read_model(path), places, draft, control, adjusted=adjusted, seed=seed

@@ -33,6 +33,7 @@ from colmap_netvlad.retrieval.options import RetrievalOptions
 from colmap_netvlad.retrieval.rank import rank_project
 from colmap_netvlad.runtime import progress, workers
 from colmap_netvlad.runtime.errors import InputError
+from colmap_netvlad.runtime.files import temporary_prefix
 
 DEPTH = 100
 """Candidates of each image among which its partners in other models are looked for."""
@@ -111,7 +112,9 @@ def merge_models(
     target = free_output(project.sparse) if output is None else output
     with (
         model_folder(target) as folder,
-        tempfile.TemporaryDirectory(prefix=".merge.", dir=folder.parent) as scratch,
+        tempfile.TemporaryDirectory(
+            prefix=temporary_prefix(folder.parent / "merge"), dir=folder.parent
+        ) as scratch,
     ):
         homes: list[set[str]] = []
         copies: list[tuple[str, Path]] = []

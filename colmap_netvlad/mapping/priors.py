@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from colmap_netvlad.colmap.copies import copy_images
 from colmap_netvlad.colmap.database import image_names
+from colmap_netvlad.runtime.files import temporary_prefix
 
 LOSS_SCALE = 2.795483482915107
 """Standard deviations from which a prior loses weight: the square root of 7.815, the 95 % quantile
@@ -63,7 +64,9 @@ def with_priors(database: Path, priors: PositionPriors | None, folder: Path) -> 
     if priors is None:
         yield database
         return
-    with tempfile.TemporaryDirectory(prefix=".priors.", dir=folder) as temporary:
+    with tempfile.TemporaryDirectory(
+        prefix=temporary_prefix(folder / "priors"), dir=folder
+    ) as temporary:
         copy = Path(temporary, "priors.db")
         copy_images(database, copy, image_names(database))
         write_priors(copy, priors)

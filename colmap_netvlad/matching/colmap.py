@@ -11,7 +11,6 @@ features of its chunk, and there are as many processes as processors.
 
 from __future__ import annotations
 
-import tempfile
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -25,6 +24,7 @@ from colmap_netvlad.graph.pair import IdPair
 from colmap_netvlad.matching.options import MatchOptions, Work
 from colmap_netvlad.runtime import workers
 from colmap_netvlad.runtime.errors import InputError
+from colmap_netvlad.runtime.files import scratch_folder
 from colmap_netvlad.runtime.machine import usable_processors
 
 FIRST_CHUNK = 32
@@ -47,7 +47,7 @@ def match_by_colmap(
     most = 1 if pycolmap.has_cuda else options.processes or usable_processors()
     count = max(1, min(most, len(pairs) // WORTH_A_PROCESS))
     blocks = [pairs[at : at + BLOCK] for at in range(0, len(pairs), BLOCK)]
-    with tempfile.TemporaryDirectory(prefix="colmap-netvlad-") as folder:
+    with scratch_folder() as folder:
         jobs = []
         for number in range(count):
             own = Path(folder, f"{number}")
@@ -94,7 +94,7 @@ def _match_apart(database: Path, folder: Path, pairs: Sequence[IdPair], seed: in
     """
     aliases = {image_id: f"image{image_id}" for pair in pairs for image_id in pair}
     scratch, listed = folder / "matches.db", folder / "pairs.txt"
-    pycolmap.Database.open(scratch).close()
+    engine.make_or_migrate(scratch)
     try:
         copy_features(database, scratch, aliases)
         listed.write_text("".join(f"{aliases[a]} {aliases[b]}\n" for a, b in pairs))

@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 from scipy import sparse
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
@@ -63,7 +62,7 @@ def match_pairs(
             logger.warning(note)
         names = {image_id: name for name, image_id in ids.items()}
         _check_features(database, names, todo, keypoints, descriptors)
-        pycolmap.Database.open(database).close()  # brings an old schema up to date
+        engine.make_or_migrate(database)  # brings an old schema up to date
         with progress.step("Matching pairs", len(todo)) as bar:
             work = matcher.match(database, in_tiles(todo), options, bar.advance)
     seconds = time.monotonic() - start
