@@ -106,6 +106,13 @@ def test_reconstruct_takes_the_list(controlled: Controlled, tmp_path: Path) -> N
     assert result.exit_code == 0, result.output
     assert "10 control points" in result.output
     assert_in_place(controlled, tmp_path / "sparse/0")
+    page = (tmp_path / "sparse/0/report.html").read_text("utf-8")
+    points = json.loads((tmp_path / "sparse/0/georeference.json").read_text())["ground_points"]
+    assert '<h2 id="h-ground">Ground points</h2>' in page
+    for name, point in points["points"].items():
+        east = f"{point['residual'][0]:.3f}".replace("-", "−")
+        assert f'<th scope="row">{name}</th><td>control</td>' in page
+        assert f"<td>{east}</td>" in page.replace("-", "−")
 
 
 Lines = list[str]

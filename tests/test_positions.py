@@ -141,7 +141,7 @@ def test_a_flight_across_the_antimeridian_is_one_flight() -> None:
 
 def test_a_missing_height_is_not_taken_for_zero(tmp_path: Path) -> None:
     exif = Image.Exif()
-    exif.get_ifd(0x8825).update({1: "N", 2: (47, 0, 0), 3: "E", 4: (8, 0, 0)})
+    exif[0x8825] = {1: "N", 2: (47, 0, 0), 3: "E", 4: (8, 0, 0)}
     Image.new("RGB", (32, 32)).save(tmp_path / "a.jpg", exif=exif)
     prior = read_gps(tmp_path / "a.jpg")
     assert prior is not None

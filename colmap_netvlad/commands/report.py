@@ -15,6 +15,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from colmap_netvlad.colmap.database import open_database
+from colmap_netvlad.geo.georeference import FILE as GEOREFERENCE
 from colmap_netvlad.mapping.extend import largest_model, read_model
 from colmap_netvlad.photos.files import leaves_folder
 from colmap_netvlad.photos.positions import place, read_gps
@@ -22,6 +23,7 @@ from colmap_netvlad.project import DATABASE_NAMES
 from colmap_netvlad.report.flight_page import render_flight_page
 from colmap_netvlad.report.quality import (
     Check,
+    GroundPoint,
     Level,
     Quality,
     Run,
@@ -133,12 +135,29 @@ def write_report(
         positions=find_positions(model, database, images),
         elsewhere=_elsewhere(model, folder),
         run=read_run(folder),
+        ground=read_ground_points(folder),
     )
     quality = measure(source)
     checks = judge(quality)
     page = output or folder / PAGE
     write_atomically(page, render_flight_page(quality, checks))
     return FlightReport(page, quality, checks)
+
+
+def read_ground_points(folder: Path) -> list[GroundPoint]:
+    """Return how ground points lie in a georegistered model; none where it has none."""
+    path = folder / GEOREFERENCE
+    if not path.is_file():
+        return []
+    try:
+        points = (json.loads(path.read_text("utf-8"))["ground_points"] or {}).get("points", {})
+        return [
+            GroundPoint(name, point["check"], point["residual"], point["pixels"])
+            for name, point in points.items()
+        ]
+    except (ValueError, KeyError, TypeError, AttributeError):
+        logger.warning("%s cannot be read; the report has no ground points.", path)
+        return []
 
 
 def model_of(sparse: Path) -> Path:

@@ -526,7 +526,7 @@ def _along_tree(edges: NDArray[np.int64], strength: Floats, step: Floats, count:
     x = np.zeros(count)
     if not len(edges):
         return x
-    i, j = edges.T
+    i, j = edges.T.astype(np.int32)  # csgraph's trees take no wider indices in scipy 1.12
     graph = sparse.coo_array((1 / strength, (i, j)), shape=(count, count)).tocsr()
     tree = minimum_spanning_tree(graph)
     steps = {(a, b): s for (a, b), s in zip(edges.tolist(), step.tolist(), strict=True)}

@@ -103,6 +103,7 @@ def render_flight_page(quality: Quality, checks: Sequence[Check]) -> str:
         pixel=pixel_size(quality),
         gps=quality.errors_against_gps,
         residuals=_residual_rows(quality),
+        ground=quality.source.ground,
         enough=ENOUGH,
         plan=_plan(quality),
         overlap=_overlap(quality),

@@ -70,6 +70,28 @@ class Run:
 
 
 @dataclass(frozen=True)
+class GroundPoint:
+    """How a surveyed point lies in the model.
+
+    Attributes:
+        name: of the list of ground points.
+        check: it was not used for placing the model, only measured.
+        residual: computed minus surveyed: east, north, up, m; None where it could not be told.
+        pixels: mean reprojection error of its marks, px.
+    """
+
+    name: str
+    check: bool
+    residual: Sequence[float | None]
+    pixels: float | None
+
+    @property
+    def figures(self) -> list[float | None]:
+        """East, north, up, m, and px: a row of the page."""
+        return [*self.residual, self.pixels]
+
+
+@dataclass(frozen=True, eq=False)
 class Source:
     """What a report is made from. What is None is not there, and the page says so.
 
@@ -82,6 +104,7 @@ class Source:
         positions: known positions by image name: east, north, up, m.
         elsewhere: images by the other models of the same run that have them.
         run: how the model was made.
+        ground: surveyed points, where the model was placed or measured by some.
     """
 
     name: str
@@ -92,6 +115,7 @@ class Source:
     positions: Mapping[str, Floats] = field(default_factory=dict)
     elsewhere: Mapping[str, str] = field(default_factory=dict)
     run: Run | None = None
+    ground: Sequence[GroundPoint] = ()
 
 
 @dataclass(frozen=True)
