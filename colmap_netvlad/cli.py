@@ -33,6 +33,7 @@ from colmap_netvlad.cli_options import (
     matching_options,
     method_option,
     model_database_option,
+    model_images_option,
     output_option,
     place_options,
     project_options,
@@ -373,13 +374,7 @@ def add(
 @cli.command()
 @sparse_option
 @model_database_option
-@click.option(
-    "--images",
-    "--image_path",
-    "images",
-    type=PATH,
-    help="Folder that image names are relative to.  [default: images beside the database]",
-)
+@model_images_option
 @output_option(help="The page.  [default: report.html in the model's folder]")
 @verbose_option
 def report(sparse: Path, database: Path | None, images: Path | None, output: Path | None) -> None:
@@ -407,14 +402,7 @@ def given_command() -> str:
 @cli.command()
 @sparse_option
 @model_database_option
-@click.option(
-    "--images",
-    "--image_path",
-    "images",
-    type=FOLDER,
-    help="Photo folder, for EXIF GPS.  [default: images/ beside the model's folder, where there"
-    " is one]",
-)
+@model_images_option
 @output_option(
     help="Folder of the models in the world.  [default: the given one's name + -georegistered]"
 )

@@ -80,6 +80,14 @@ pairs_option = click.option(
 sparse_option = click.option(
     "--sparse", type=PATH, required=True, help="A COLMAP model, or a folder of models 0, 1, ..."
 )
+model_images_option = click.option(
+    "--images",
+    "--image_path",
+    "images",
+    type=PATH,
+    help="Photo folder, for EXIF GPS and thumbnails.  [default: images beside the database or the"
+    " model, where there is one]",
+)
 model_database_option = click.option(
     "--db",
     "--database_path",
