@@ -69,14 +69,18 @@ def flight_database(flight: RenderedFlight, shared_folder: Path) -> Path:
         options = pycolmap.FeatureExtractionOptions()
         options.num_threads = 2
         options.sift.max_num_features = 1500
+        database = folder / "project.db"
+        pycolmap.Database.open(database).close()
+        # Apart from the extraction, whose threads would number the photos as they finish.
+        names = sorted(flight.names)
+        pycolmap.import_images(database, flight.images, pycolmap.CameraMode.SINGLE, names)
         pycolmap.extract_features(
-            folder / "project.db",
+            database,
             flight.images,
-            camera_mode=pycolmap.CameraMode.SINGLE,
             extraction_options=options,
             device=pycolmap.Device.cpu,
         )
-        _settle(folder / "project.db")
+        _settle(database)
 
     return make_once(shared_folder / "features", make) / "project.db"
 
