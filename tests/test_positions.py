@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
+from colmap_netvlad.colmap.positions import find_priors
 from colmap_netvlad.photos.positions import CoordinateSystem, PosePrior, place, read_gps
 
 NAMES = [f"DJI_{i:04d}.JPG" for i in range(5)]
@@ -151,3 +152,13 @@ def test_a_missing_height_is_not_taken_for_zero(tmp_path: Path) -> None:
     assert positions.metres[0, 2] == pytest.approx(0.0, abs=0.01)  # for those that want a number
     assert positions.geographic is not None
     assert np.isnan(positions.geographic[0, 2])
+
+
+def test_a_name_that_leads_out_of_the_photo_folder_is_not_opened(tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif[0x8825] = {1: "N", 2: (47, 0, 0), 3: "E", 4: (8, 0, 0)}
+    (tmp_path / "photos").mkdir()
+    for name in ("outside.jpg", "photos/inside.jpg"):
+        Image.new("RGB", (32, 32)).save(tmp_path / name, exif=exif)
+    outside, inside = find_priors(["../outside.jpg", "inside.jpg"], None, tmp_path / "photos")
+    assert outside is None and inside is not None

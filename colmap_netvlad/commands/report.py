@@ -14,11 +14,11 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from colmap_netvlad.colmap.database import open_database
+from colmap_netvlad.colmap.database import image_names, open_database
+from colmap_netvlad.colmap.positions import find_priors
 from colmap_netvlad.geo.georeference import FILE as GEOREFERENCE
 from colmap_netvlad.mapping.extend import largest_model, read_model
-from colmap_netvlad.photos.files import leaves_folder
-from colmap_netvlad.photos.positions import place, read_gps
+from colmap_netvlad.photos.positions import place
 from colmap_netvlad.project import DATABASE_NAMES
 from colmap_netvlad.report.flight_page import render_flight_page
 from colmap_netvlad.report.quality import (
@@ -33,7 +33,6 @@ from colmap_netvlad.report.quality import (
     overall,
     verdict_lines,
 )
-from colmap_netvlad.runtime import progress
 from colmap_netvlad.runtime.errors import InputError
 from colmap_netvlad.runtime.files import write_atomically
 from colmap_netvlad.runtime.version import VERSION
@@ -186,22 +185,10 @@ def find_positions(
     Position priors of the database come first, then GPS in the photos.
     """
     names = {image.name for image in model.images.values()}
-    priors = {}
     if database is not None:
-        with open_database(database) as opened:
-            by_id = {row.image_id: row.name for row in opened.images()}
-            priors = {by_id[i]: p for i, p in opened.pose_priors().items() if i in by_id}
-        names.update(by_id.values())
+        names.update(image_names(database))
     listed = sorted(names)
-    found = [priors.get(name) for name in listed]
-    unknown = [i for i, prior in enumerate(found) if prior is None]
-    if images is not None and unknown:
-        with progress.step("Reading GPS of photos", len(unknown)) as bar:
-            for i in unknown:
-                if not leaves_folder(listed[i]):
-                    found[i] = read_gps(images / listed[i])
-                bar.advance()
-    metres = place(found, listed).metres
+    metres = place(find_priors(listed, database, images), listed).metres
     return {name: row for name, row in zip(listed, metres, strict=True) if np.isfinite(row).all()}
 
 

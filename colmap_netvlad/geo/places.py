@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_netvlad.colmap.database import open_database
+from colmap_netvlad.colmap.positions import find_priors
 from colmap_netvlad.geo.frames import LocalFrame, frame_of
 from colmap_netvlad.photos.accuracy import read_deviations
-from colmap_netvlad.photos.positions import PosePrior, place, read_gps
+from colmap_netvlad.photos.positions import place
 from colmap_netvlad.runtime import progress
 
 Array = NDArray[np.float64]
@@ -68,21 +69,7 @@ def find_places(names: Sequence[str], database: Path | None, images: Path | None
         database: COLMAP database, or None where there is none.
         images: photo folder, or None where it is not known.
     """
-    priors: dict[str, PosePrior] = {}
-    if database is not None:
-        with open_database(database) as opened:
-            by_id = opened.pose_priors()
-            priors = {
-                row.name: by_id[row.image_id] for row in opened.images() if row.image_id in by_id
-            }
-    found = [priors.get(name) for name in names]
-    missing = [i for i, prior in enumerate(found) if prior is None]
-    if missing and images is not None and images.is_dir():
-        with progress.step("Reading GPS of photos", len(missing)) as bar:
-            for i in missing:
-                found[i] = read_gps(images / names[i])
-                bar.advance()
-    positions = place(found, names)
+    positions = place(find_priors(names, database, images), names)
     if positions.geographic is None:
         return Places(tuple(names), positions.metres, None, positions.notes)
     if not positions.known.any():
