@@ -6,6 +6,7 @@ import sqlite3
 import subprocess
 import sys
 import textwrap
+import threading
 from contextlib import closing
 from pathlib import Path
 
@@ -163,6 +164,18 @@ def test_two_processes_writing_at_once_lose_nothing(cache: Path) -> None:
     with Store(cache) as store:
         assert len(store.described("m")) == 2 * 30 * 4
         assert store._db.execute("PRAGMA integrity_check").fetchone()[0] == "ok"
+
+
+def test_a_new_cache_waits_for_another_process_that_makes_it_too(cache: Path) -> None:
+    other = sqlite3.connect(cache, isolation_level=None, check_same_thread=False)
+    other.execute("BEGIN IMMEDIATE")
+    other.execute("CREATE TABLE half (made INTEGER)")
+    done = threading.Timer(0.5, lambda: other.execute("ROLLBACK"))
+    done.start()
+    with Store(cache) as store:
+        assert store.described("m") == {}
+    done.join()
+    other.close()
 
 
 def test_a_killed_run_leaves_whole_batches_only(cache: Path) -> None:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import os
 import sqlite3
+import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -298,13 +299,11 @@ class Store:
         self.remember(IMAGES_SETTING, os.path.relpath(folder, base) if inside else str(folder))
 
     def _open(self) -> None:
-        application = self._pragma("application_id")
-        tables = self._pragma("schema_version")
+        application, tables, version = self._header()
         if application != APPLICATION and tables:
             raise InputError(
                 f"{self.path} is not a cache of colmap-netvlad; name another file with `cache`."
             )
-        version = self._pragma("user_version")
         if tables and version not in READ_FORMATS:
             raise InputError(
                 f"The cache {self.path} has format {version}, this version of colmap-netvlad reads "
@@ -314,7 +313,7 @@ class Store:
         if not tables:
             # Large pages: a descriptor of 64 KiB then lies in few of them.
             self._db.execute("PRAGMA page_size = 32768")
-            self._db.execute("PRAGMA journal_mode = WAL")
+            self._log_ahead()
         if version != FORMAT:
             self._create()
         if self.setting(ORPHANS_SETTING):
@@ -368,8 +367,31 @@ class Store:
             )
             self._db.execute("DELETE FROM settings WHERE key = ?", [ORPHANS_SETTING])
 
+    def _header(self) -> tuple[int, int, int]:
+        """Return application, schema version (0: no tables) and format, all of one moment."""
+        names = ("application_id", "schema_version", "user_version")
+        self._db.execute("BEGIN")
+        try:
+            first, second, third = (self._pragma(name) for name in names)
+        finally:
+            if self._db.conn.in_transaction:
+                self._db.execute("ROLLBACK")
+        return first, second, third
+
     def _pragma(self, name: str) -> int:
         return int(self._db.execute(f"PRAGMA {name}").fetchone()[0])
+
+    def _log_ahead(self) -> None:
+        """Turn the write-ahead log on; here alone SQLite does not wait for another process."""
+        deadline = time.monotonic() + BUSY_SECONDS
+        while True:
+            try:
+                self._db.execute("PRAGMA journal_mode = WAL")
+                return
+            except sqlite3.OperationalError as fault:
+                if "locked" not in str(fault) or time.monotonic() > deadline:
+                    raise
+                time.sleep(0.02)
 
     @contextmanager
     def _transaction(self) -> Iterator[None]:
