@@ -79,7 +79,8 @@ def test_reprojection_errors_are_colmaps(mapped):
         assert data.errors[i] == pytest.approx(np.mean(errors))
         regions = data.regions[image.camera_id]
     assert regions.count.sum() == data.observations.sum()
-    assert regions.lengths.sum() / regions.count.sum() == pytest.approx(data.mean_error)
+    assert regions.lengths.sum() / regions.count.sum() == pytest.approx(data.observation_error)
+    assert data.mean_error == pytest.approx(model.compute_mean_reprojection_error())
 
 
 def test_model_lies_on_its_positions_and_one_wrong_position_turns_nothing(grid):

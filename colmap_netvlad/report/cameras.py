@@ -175,7 +175,7 @@ def _middle_part(model: pycolmap.Reconstruction, data: ModelData) -> pycolmap.Re
 def _residual_variance(data: ModelData) -> float:
     """Variance of one coordinate of a keypoint, px squared: from the mean error, as its length
     has a Rayleigh distribution."""
-    return float((data.mean_error / np.sqrt(np.pi / 2)) ** 2)
+    return float((data.observation_error / np.sqrt(np.pi / 2)) ** 2)
 
 
 def _see_alike(views: Floats, heights: Floats, relief: float, height: float) -> bool:

@@ -248,7 +248,7 @@ def _charts(quality: Quality) -> list[Picture]:
     if not len(data.points):
         return []
     length = f"{data.mean_track_length:.2f}"
-    error = f"{data.mean_error:.2f}"
+    error = f"{data.observation_error:.2f}"
     return [
         Picture(
             "Track lengths",
@@ -260,7 +260,8 @@ def _charts(quality: Quality) -> list[Picture]:
             "Reprojection errors",
             f"Histogram of reprojection errors; {error} px on average.",
             svg=Markup(plots.error_histogram(data.histogram)),
-            caption=f"{error} px on average over {int(data.observations.sum()):,} observations.",
+            caption=f"{error} px on average over {int(data.observations.sum()):,} observations, "
+            f"{data.mean_error:.2f} px over points (COLMAP's figure).",
         ),
         Picture(
             "Keypoints and points a photo",

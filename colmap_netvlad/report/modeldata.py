@@ -52,6 +52,7 @@ class ModelData:
         point_ids: (P) COLMAP's ids of them, ascending.
         colours: (P, 3) uint8 RGB.
         track_lengths: (P) images that see a point.
+        point_errors: (P) mean reprojection error of a point's observations, px.
         seen_points: (M) points, image after image: image i's are
             `seen_points[starts[i]:starts[i + 1]]`.
         starts: (N + 1) see above.
@@ -73,6 +74,7 @@ class ModelData:
     point_ids: NDArray[np.int64]
     colours: NDArray[np.uint8]
     track_lengths: NDArray[np.int64]
+    point_errors: Floats
     seen_points: NDArray[np.int32]
     starts: NDArray[np.int64]
     histogram: NDArray[np.int64]
@@ -80,6 +82,14 @@ class ModelData:
 
     @property
     def mean_error(self) -> float:
+        """Mean reprojection error as COLMAP gives it, px: over points, not over observations.
+
+        NaN without points.
+        """
+        return float(np.nanmean(self.point_errors)) if len(self.points) else float("nan")
+
+    @property
+    def observation_error(self) -> float:
         """Mean reprojection error of all observations, px; NaN without any."""
         seen = self.observations > 0
         total = int(self.observations.sum())
@@ -99,6 +109,7 @@ def read_model_data(model: pycolmap.Reconstruction) -> ModelData:
     ids = np.array([point_id for point_id, _ in listed], np.int64)
     regions: dict[int, CameraErrors] = {}
     histogram = np.zeros(len(ERROR_BINS), np.int64)
+    point_sums = np.zeros(len(points))
     observations, errors, depths, reaches, seen = [], [], [], [], []
     for image in images:
         camera = model.cameras[image.camera_id]
@@ -109,6 +120,7 @@ def read_model_data(model: pycolmap.Reconstruction) -> ModelData:
         offsets = pixels - camera.img_from_cam(local, check_cheirality=False)
         length = np.linalg.norm(offsets, axis=1)
         whole = np.isfinite(length)
+        np.add.at(point_sums, index, length)
         observations.append(len(observed))
         errors.append(float(length[whole].mean()) if whole.any() else np.nan)
         depths.append(float(np.median(local[:, 2])) if len(local) else np.nan)
@@ -118,6 +130,7 @@ def read_model_data(model: pycolmap.Reconstruction) -> ModelData:
         bins = np.digitize(length[whole], ERROR_BINS) - 1
         histogram += np.bincount(bins, minlength=len(ERROR_BINS))
         _gather(regions, camera, pixels[whole], offsets[whole], length[whole])
+    track_lengths = np.array([point.track.length() for _, point in listed], np.int64)
     return ModelData(
         names=tuple(image.name for image in images),
         ids=np.array([image.image_id for image in images], np.int64),
@@ -134,7 +147,8 @@ def read_model_data(model: pycolmap.Reconstruction) -> ModelData:
         points=points,
         point_ids=ids,
         colours=np.array([point.color for _, point in listed], np.uint8).reshape(-1, 3),
-        track_lengths=np.array([point.track.length() for _, point in listed], np.int64),
+        track_lengths=track_lengths,
+        point_errors=point_sums / np.maximum(track_lengths, 1),
         seen_points=np.concatenate([*seen, np.zeros(0, np.int32)]),
         starts=np.concatenate([[0], np.cumsum(observations)]).astype(np.int64),
         histogram=histogram,

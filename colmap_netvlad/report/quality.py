@@ -363,7 +363,7 @@ def _overlap(quality: Quality) -> Check:
 def _reprojection(quality: Quality) -> Check:
     error = quality.data.mean_error
     level = _level(error, 1.0, 1.5)
-    reason = "Distance between keypoints and projected points, mean of all observations."
+    reason = "Distance between keypoints and projected points, mean of all points."
     if level in ("yellow", "red"):
         reason += " Blur, a rolling shutter, or a camera model that does not fit the lens."
     return Check("Reprojection error", number(error, "px", 2), level, reason)
