@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from ranks import from_lists
 from scipy import sparse
 
-from colmap_netvlad.cache.ranking import NO_PARTNER, Ranking, from_lists
+from colmap_netvlad.cache.ranking import NO_PARTNER, Ranking
 from colmap_netvlad.retrieval.fusion import expand, fuse, keep_best, ranking_of, similarity_matrix
 from colmap_netvlad.runtime.errors import InputError
 

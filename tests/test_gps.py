@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from ranks import from_lists
 from scipy import sparse
 
-from colmap_netvlad.cache.ranking import NO_PARTNER, from_lists
+from colmap_netvlad.cache.ranking import NO_PARTNER
 from colmap_netvlad.photos.positions import Positions
 from colmap_netvlad.retrieval.gps import NEUTRAL, add_nearness, near_first
 

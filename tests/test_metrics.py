@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from ranks import from_lists
 from sklearn.metrics import average_precision_score
 
 from colmap_netvlad import metrics
-from colmap_netvlad.cache.ranking import Ranking, from_lists
+from colmap_netvlad.cache.ranking import Ranking
 from colmap_netvlad.graph.pair import as_pair
 from colmap_netvlad.graph.verified import CORRECT_MATCHES, correct_pairs
 

@@ -12,11 +12,16 @@ from colmap_netvlad.mapping.partition import (
     bisect,
     cut,
     fiedler_vector,
-    normalised_cut,
     normalised_cuts,
     partition,
 )
 from colmap_netvlad.runtime.errors import InputError
+
+
+def normalised_cut(weights: sparse.csr_array, left: np.ndarray) -> float:
+    """Return Ncut of one bipartition, given as (N) membership of the left side."""
+    order = np.concatenate([np.flatnonzero(left), np.flatnonzero(~left)])
+    return float(normalised_cuts(weights, order)[int(left.sum()) - 1])
 
 
 def view_graph(graph: nx.Graph) -> ViewGraph:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from ranks import from_lists
 
-from colmap_netvlad.cache.ranking import NO_PARTNER, Ranking, from_lists
+from colmap_netvlad.cache.ranking import NO_PARTNER, Ranking
 from colmap_netvlad.pairs.rules import (
     join_pairs,
     sequential_pairs,

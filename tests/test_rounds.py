@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from ranks import from_lists
 from scipy import sparse
 
-from colmap_netvlad.cache.ranking import Ranking, from_lists
+from colmap_netvlad.cache.ranking import Ranking
 from colmap_netvlad.graph.verified import CORRECT_MATCHES
 from colmap_netvlad.pairs.rounds import (
     SATURATION,

@@ -61,20 +61,3 @@ class Ranking:
         if self.every_pair:
             return self
         return replace(self, partners=self.partners[:, :k], scores=self.scores[:, :k])
-
-
-def from_lists(
-    names: tuple[str, ...],
-    lists: list[list[tuple[int, float]]],
-    method: str,
-    **times_and_notes: object,
-) -> Ranking:
-    """Build a ranking from ragged lists of (partner index, score), best first."""
-    depth = max((len(row) for row in lists), default=0)
-    partners = np.full((len(names), depth), NO_PARTNER, dtype=np.int32)
-    scores = np.full((len(names), depth), -np.inf, dtype=np.float32)
-    for i, row in enumerate(lists):
-        for rank, (partner, score) in enumerate(row):
-            partners[i, rank] = partner
-            scores[i, rank] = score
-    return Ranking(names, partners, scores, method, **times_and_notes)  # type: ignore[arg-type]

@@ -162,12 +162,6 @@ def normalised_cuts(weights: sparse.csr_array, order: Positions) -> NDArray[np.f
     return np.where((left > 0) & (right > 0), value, 2.0)
 
 
-def normalised_cut(weights: sparse.csr_array, left: NDArray[np.bool_]) -> float:
-    """Return Ncut of one bipartition, given as (N) membership of the left side."""
-    order = np.concatenate([np.flatnonzero(left), np.flatnonzero(~left)])
-    return float(normalised_cuts(weights, order)[int(left.sum()) - 1])
-
-
 def _polish(weights: sparse.csr_array, left: NDArray[np.bool_], smallest: int) -> NDArray[np.bool_]:
     """Move the image to the other side that lowers Ncut most, until none does.
 

@@ -10,8 +10,7 @@ The defaults are the paper's recipe (section 4.2). A recipe is a TOML file with 
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -235,8 +234,3 @@ def read_recipe(path: Path) -> dict[str, Any]:
         if type(value) is not kind:
             raise InputError(f"In the recipe {path}, {name} must be a {kind.__name__}.")
     return record
-
-
-def with_settings(options: TrainOptions, settings: Mapping[str, Any]) -> TrainOptions:
-    """Return options with some settings changed."""
-    return replace(options, **settings)
