@@ -6,7 +6,7 @@ Each try changes one sound input (flipped, cut or overwritten bytes, impossible 
 gives it to a command or a function of the library, in a process of its own. Wanted is success or
 one sentence; a traceback, a process that dies, more than 60 s or 2 GiB, or a changed database
 where it is only read, counts as a fault and is printed with the number of its try, which
-`--only NUMBER` repeats.
+`--first NUMBER` with a count of 1 repeats. `--minutes` ends a run early; it says where to go on.
 """
 
 from __future__ import annotations
@@ -460,11 +460,15 @@ SHORT = {"databases": 8, "photos": 20, "lists": 40, "caches": 4, "checkpoints": 
 # Many tries
 
 
-def fuzz(base: Base, kind: str, numbers: range, seed: int) -> tuple[Counter[str], list[str]]:
+def fuzz(
+    base: Base, kind: str, numbers: range, seed: int, until: float
+) -> tuple[Counter[str], list[str]]:
     """Return how tries ended, and the faults among them with their numbers."""
     function, ended, faults = KINDS[kind][0], Counter[str](), list[str]()
     place = sorted(KINDS).index(kind)
     for number in numbers:
+        if time.monotonic() > until:
+            break
         folder = base.folder / f"{kind}-{number}"
         folder.mkdir()
 
@@ -541,24 +545,25 @@ def main() -> int:
     parser.add_argument("kind", choices=[*KINDS, "short"], help="short: a few tries of each kind")
     parser.add_argument("count", type=int, nargs="?", help="how many tries [default: all]")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--only", type=int, help="repeat the try of this number")
+    parser.add_argument("--first", type=int, default=0, help="begin with the try of this number")
+    parser.add_argument("--minutes", type=float, default=float("inf"), help="start no try after")
     chosen = parser.parse_args()
+    until = time.monotonic() + 60 * chosen.minutes
     if chosen.kind == "short":
         todo = {kind: range(count) for kind, count in SHORT.items()}
-    elif chosen.only is not None:
-        todo = {chosen.kind: range(chosen.only, chosen.only + 1)}
     else:
-        todo = {chosen.kind: range(chosen.count or KINDS[chosen.kind][1])}
+        count = chosen.count or KINDS[chosen.kind][1] - chosen.first
+        todo = {chosen.kind: range(chosen.first, chosen.first + count)}
     failed = False
     with tempfile.TemporaryDirectory(prefix="fuzz-") as folder:
         base = make_base(Path(folder))
         for kind, numbers in todo.items():
-            ended, faults = fuzz(base, kind, numbers, chosen.seed)
+            ended, faults = fuzz(base, kind, numbers, chosen.seed, until)
             failed |= bool(faults)
-            print(
-                f"{kind}: {len(numbers)} tries, {len(faults)} with faults",
-                dict(sorted(ended.items())),
-            )
+            tries = ended.total()
+            print(f"{kind}: {tries} tries, {len(faults)} with faults", dict(sorted(ended.items())))
+            if tries < len(numbers):
+                print(f"go on with --first {numbers.start + tries}")
             print(*faults, sep="\n\n", flush=True)
     return 1 if failed else 0
 
