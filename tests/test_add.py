@@ -137,3 +137,31 @@ def test_a_stopped_addition_goes_on_with_the_same_photos(
     assert report.after.registered == report.before.registered + NEW
     with pytest.raises(InputError, match="There are no new photos"):
         add_photos(project, newest_model(project), OPTIONS)
+
+
+def test_an_addition_stopped_before_its_page_makes_no_other_model(
+    reconstructed: tuple[Project, list[Path]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    project, photos = reconstructed
+    assert project.images is not None
+    for photo in photos:
+        shutil.copy(photo, project.images / photo.name)
+
+    def stop(*arguments: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(add, "report_models", stop)
+        with pytest.raises(KeyboardInterrupt):
+            add_photos(project, None, OPTIONS)
+    extended = project.folder / "sparse-2" / "0"
+    made = (extended / "images.bin").read_bytes()
+    assert newest_model(project) == extended and not (extended / "report.html").exists()
+
+    report = add_photos(project, None, OPTIONS)
+    assert report.output == extended.parent and not (project.folder / "sparse-3").exists()
+    assert (extended / "images.bin").read_bytes() == made and (extended / "report.html").exists()
+    assert report.new == sorted(photo.name for photo in photos)
+    assert report.after.registered == report.before.registered + NEW
+    with pytest.raises(InputError, match="There are no new photos"):
+        add_photos(project, None, OPTIONS)

@@ -211,6 +211,18 @@ class Database:
             for image_id, count, size, head in rows
         }
 
+    def verified_fingerprint(self) -> str:
+        """Return a fingerprint of what mapping reads: images, their features, verified matches."""
+        digest = hashlib.sha256()
+        fingerprints = self.feature_fingerprints()
+        for image in self.images():
+            digest.update(f"{image} {fingerprints.get(image.image_id)}\n".encode())
+        for pair, data in self.connection.execute(
+            "SELECT pair_id, data FROM two_view_geometries WHERE rows > 0 ORDER BY pair_id"
+        ):
+            digest.update(b"%d " % pair + data)
+        return digest.hexdigest()
+
     def matched_pairs(self) -> set[tuple[int, int]]:
         """Return the pairs COLMAP's matchers would skip: those with matches and a geometry.
 

@@ -12,9 +12,16 @@ import numpy as np
 
 from colmap_netvlad.cache.ranking import NO_PARTNER, Ranking
 from colmap_netvlad.cache.store import Store
-from colmap_netvlad.colmap.database import image_names
+from colmap_netvlad.colmap.database import image_names, open_database
 from colmap_netvlad.colmap.features import FeatureOptions, FeatureReport, extract_features
-from colmap_netvlad.commands.report import FlightReport, report_models, run_of
+from colmap_netvlad.commands.report import (
+    FlightReport,
+    made_before,
+    read_run,
+    report_models,
+    run_of,
+    save_runs,
+)
 from colmap_netvlad.mapping.extend import extend_model, largest_model, read_model
 from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.mapping.output import free_output
@@ -28,8 +35,21 @@ from colmap_netvlad.retrieval.rank import rank_project
 from colmap_netvlad.runtime.errors import InputError
 from colmap_netvlad.runtime.sequences import listed
 
-UNFINISHED_SETTING = "adding"
-"""The cache's setting with the names of photos whose adding has begun, JSON."""
+BEGUN_SETTING = "adding"
+"""The cache's setting with what is being added, JSON."""
+
+
+@dataclass(frozen=True)
+class Begun:
+    """An addition that has not come to its end: the database may have the photos.
+
+    Attributes:
+        photos: their names.
+        model: folder of the model they are to join.
+    """
+
+    photos: Sequence[str] = ()
+    model: str = ""
 
 
 @dataclass(frozen=True)
@@ -102,13 +122,15 @@ def add_photos(
     Raises:
         InputError: no new photos, a folder that lacks the old photos, or no such model.
     """
-    model = model or newest_model(project)
+    model = (model or newest_model(project)).absolute()
     folder = project.need_images()
-    unfinished = _unfinished(project)
-    old = tuple(name for name in image_names(project.database) if name not in unfinished)
+    begun = _begun(project)
+    if begun.photos and _extends(model) == begun.model:
+        model = Path(begun.model)  # the newest model is what the stopped run had made of it
+    old = tuple(name for name in image_names(project.database) if name not in set(begun.photos))
     new = _new_photos(folder, old)
     before = read_model(model)
-    _remember_unfinished(project, new)
+    _remember(project, Begun(new, str(model)))
     seconds: dict[str, float] = {}
 
     start = time.monotonic()
@@ -129,20 +151,27 @@ def add_photos(
     seconds["matching"] = matches.seconds
 
     start = time.monotonic()
-    target = free_output(output or project.sparse)
-    after = extend_model(
-        project.database,
-        folder,
-        model,
-        target,
-        len(usable),
-        MappingOptions(seed=options.seed),
-    )
-    seconds["mapping"] = time.monotonic() - start
-    run = run_of(options.command or "add, called from Python", seconds, asdict(options))
-    quality = report_models(target, project.database, folder, run)
+    told = {**asdict(options), "model": str(model)}
+    run = run_of(options.command or "add, called from Python", {}, told)
+    with open_database(project.database) as database:
+        run = replace(run, source=database.verified_fingerprint())
+
+    def finish(models: Path) -> None:
+        """Note how the model was made."""
+        seconds["mapping"] = time.monotonic() - start
+        save_runs(models, replace(run, seconds=seconds))
+
+    target = made_before(output or project.sparse, run) if begun.photos else None
+    if target is not None:
+        after = read_model(target / "0")
+        seconds["mapping"] = 0.0
+    else:
+        target = free_output(output or project.sparse)
+        mapping = MappingOptions(seed=options.seed)
+        after = extend_model(project.database, folder, model, target, len(usable), mapping, finish)
+    quality = report_models(target, project.database, folder)
     registered = registered_names([after])
-    _remember_unfinished(project, [])
+    _remember(project, Begun())
     return AddReport(
         new=usable,
         features=features,
@@ -201,15 +230,24 @@ def _number(name: str) -> int:
     return int(suffix) if suffix.isdigit() else 1
 
 
-def _unfinished(project: Project) -> set[str]:
-    """Return the photos whose adding was stopped: the database may have them, no model does."""
-    with Store(project.cache) as store:
-        return set(json.loads(store.setting(UNFINISHED_SETTING) or "[]"))
+def _extends(model: Path) -> str | None:
+    """Return the folder of the model that one was made of by `add`; None for any other."""
+    run = read_run(model)
+    return None if run is None else run.options.get("model")
 
 
-def _remember_unfinished(project: Project, names: Sequence[str]) -> None:
+def _begun(project: Project) -> Begun:
     with Store(project.cache) as store:
-        store.remember(UNFINISHED_SETTING, json.dumps(names))
+        kept = store.setting(BEGUN_SETTING)
+    try:
+        return Begun(**json.loads(kept or "{}"))
+    except (ValueError, TypeError):  # damaged
+        return Begun()
+
+
+def _remember(project: Project, begun: Begun) -> None:
+    with Store(project.cache) as store:
+        store.remember(BEGUN_SETTING, json.dumps(asdict(begun)))
 
 
 def _new_photos(folder: Path, old: tuple[str, ...]) -> list[str]:

@@ -127,7 +127,7 @@ def merge_models(
         pairs = pairs_across(_ranking(project, options), homes, options.across)
         matches = match_pairs(project.database, pairs, MatchOptions(seed=options.seed))
         told = _join(project, copies, folder, options)
-    placed = _georegister(project, target, options.seed)
+        placed = _georegister(project, folder, options.seed)
     return MergeReport(
         output=target,
         before=[(name, len(home)) for name, home in zip(names, homes, strict=True)],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from colmap_netvlad.colmap.copies import copy_with_pairs
-from colmap_netvlad.colmap.database import image_names
+from colmap_netvlad.colmap.database import image_names, open_database
 from colmap_netvlad.commands.georegister import (
     Placed,
     WorldOptions,
@@ -27,7 +28,14 @@ from colmap_netvlad.commands.match import (
     view_graph_lines,
 )
 from colmap_netvlad.commands.match import as_json as match_json
-from colmap_netvlad.commands.report import FlightReport, report_models, run_of
+from colmap_netvlad.commands.report import (
+    FlightReport,
+    all_reported,
+    made_before,
+    report_models,
+    run_of,
+    save_runs,
+)
 from colmap_netvlad.flight import open_flight
 from colmap_netvlad.geo.align import MIN_PLACES
 from colmap_netvlad.geo.gcp import ControlList
@@ -36,8 +44,10 @@ from colmap_netvlad.graph.lookalikes import find_lookalikes
 from colmap_netvlad.graph.pair import Pair
 from colmap_netvlad.graph.verified import verified_by_name
 from colmap_netvlad.mapping import MAPPERS, WITH_PRIORS
+from colmap_netvlad.mapping.extend import read_models
 from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.mapping.output import free_output
+from colmap_netvlad.mapping.parallel import forget_clusters
 from colmap_netvlad.mapping.priors import PositionPriors
 from colmap_netvlad.mapping.summary import ModelSummary, combine, registered_names, summarize
 from colmap_netvlad.matching.options import MatchOptions, given_up_words
@@ -111,7 +121,8 @@ def reconstruct(
     """Match pairs, map, and write the sparse models, each with its quality report.
 
     It writes matches into the project's database, where COLMAP keeps them. Pairs matched before
-    are not matched again.
+    are not matched again; models of a run that was stopped before their reports are not mapped
+    again.
 
     Args:
         project: database and photos.
@@ -139,25 +150,42 @@ def reconstruct(
     if options.world.use_gps and places is not None:
         mapping, note = _with_priors(project, places, options)
         notes = (note, *notes)
-    target = free_output(output or project.sparse)
+    run = run_of(options.command or "reconstruct, called from Python", {}, asdict(options))
+    run = replace(run, source=_mapped_from(project, places, options.world))
+    seconds = {"matching": matches.seconds, "mapping": 0.0}
+    dropped: list[Pair] = []
+    placed: list[Placed] = []
     start = time.monotonic()
-    mapper = MAPPERS[options.mapper]
-    with mapping_database(project, options.drop_contradicted) as (database, dropped):
-        models = mapper(database, project.images, target, mapping)
-    seconds = {"matching": matches.seconds, "mapping": time.monotonic() - start}
+
+    def finish(folder: Path) -> None:
+        """Place the models, and note how they were made."""
+        if not any(folder.iterdir()):
+            return
+        if places is not None:
+            placed.extend(
+                georegister_in_place(
+                    folder, places, control, adjusted=options.world.use_gps, seed=mapping.seed
+                )
+            )
+        seconds["mapping"] = time.monotonic() - start
+        save_runs(folder, replace(run, seconds=seconds, dropped=len(dropped)))
+
+    target = made_before(output or project.sparse, run)
+    if target is not None and not all_reported(target):
+        models = read_models(target)
+        forget_clusters(target)
+        notes = (f"The run that made {target} was stopped before its reports; now made.", *notes)
+    else:
+        target = free_output(output or project.sparse)
+        mapper = MAPPERS[options.mapper]
+        with mapping_database(project, options.drop_contradicted) as (database, dropped):
+            models = mapper(database, project.images, target, mapping, finish)
     if not models:
         raise InputError(
             f"No model came out of {matches.verified} verified pairs: none has enough inliers and "
             "baseline to start from. More pairs (`k`) or more overlap may help."
         )
-    placed = []
-    if places is not None:
-        placed = georegister_in_place(
-            target, places, control, adjusted=options.world.use_gps, seed=mapping.seed
-        )
-    run = run_of(options.command or "reconstruct, called from Python", seconds, asdict(options))
-    run = replace(run, dropped=len(dropped))
-    quality = report_models(target, project.database, project.images, run)
+    quality = report_models(target, project.database, project.images)
     registered = registered_names(models)
     names = image_names(project.database)
     return ReconstructReport(
@@ -173,6 +201,17 @@ def reconstruct(
         placed=placed,
         notes=notes,
     )
+
+
+def _mapped_from(project: Project, places: Places | None, world: WorldOptions) -> str:
+    """Return a fingerprint of what decides on a model beside the options."""
+    with open_database(project.database) as database:
+        digest = hashlib.sha256(database.verified_fingerprint().encode())
+    if places is not None:
+        digest.update(places.metres.tobytes())
+    if world.gcp is not None:
+        digest.update(world.gcp.path.read_bytes())
+    return digest.hexdigest()
 
 
 @contextmanager

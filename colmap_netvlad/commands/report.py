@@ -18,6 +18,7 @@ from colmap_netvlad.colmap.database import image_names, open_database
 from colmap_netvlad.colmap.positions import find_priors
 from colmap_netvlad.geo.georeference import FILE as GEOREFERENCE
 from colmap_netvlad.mapping.extend import largest_model, read_model
+from colmap_netvlad.mapping.output import outputs
 from colmap_netvlad.photos.positions import place
 from colmap_netvlad.project import DATABASE_NAMES
 from colmap_netvlad.report.flight_page import render_flight_page
@@ -169,7 +170,7 @@ def model_of(sparse: Path) -> Path:
         raise InputError(f"The folder {sparse} does not exist; `sparse` names that of a model.")
     if _holds_model(sparse):
         return sparse
-    models = [folder for folder in sorted(sparse.iterdir()) if _holds_model(folder)]
+    models = _models_in(sparse)
     if not models:
         raise InputError(
             f"{sparse} holds no COLMAP model (cameras, images and points3D, .bin or .txt)."
@@ -195,6 +196,38 @@ def find_positions(
 def save_run(folder: Path, run: Run) -> None:
     """Write beside a model how it was made, so that its report can say so."""
     write_atomically(folder / RUN, json.dumps(asdict(run), indent=1) + "\n")
+
+
+def save_runs(output: Path, run: Run) -> None:
+    """Write into each model of a folder of models how they were made."""
+    for folder in _models_in(output):
+        save_run(folder, run)
+
+
+def made_before(output: Path, run: Run) -> Path | None:
+    """Return the newest of `output`, `output`-2, ... where its models are what `run` would make.
+
+    They are: the same program made them from the same matches with the same options.
+    """
+    made = [path for path in outputs(output) if path.is_dir() and _models_in(path)]
+    if not made:
+        return None
+    runs = [read_run(folder) for folder in _models_in(made[-1])]
+    same = all(
+        one is not None
+        and (one.source, one.options, one.versions) == (run.source, run.options, run.versions)
+        for one in runs
+    )
+    return made[-1] if same else None
+
+
+def all_reported(output: Path) -> bool:
+    """Whether each model of a folder of models has its page."""
+    return all((folder / PAGE).is_file() for folder in _models_in(output))
+
+
+def _models_in(output: Path) -> list[Path]:
+    return [folder for folder in sorted(output.iterdir()) if _holds_model(folder)]
 
 
 def read_run(folder: Path) -> Run | None:
@@ -242,20 +275,17 @@ def _name(folder: Path, database: Path | None) -> str:
     return workspace.name or str(folder)
 
 
-def report_models(
-    output: Path, database: Path, images: Path | None, run: Run
-) -> list[FlightReport]:
+def report_models(output: Path, database: Path, images: Path | None) -> list[FlightReport]:
     """Write the report of every model of a run, each into its folder, the largest first.
 
     A report that cannot be written is no reason to lose a model: the fault is said, and the
     others are written.
     """
-    found = [(read_model(folder), folder) for folder in sorted(output.iterdir()) if folder.is_dir()]
+    found = [(read_model(folder), folder) for folder in _models_in(output)]
     found.sort(key=lambda item: -item[0].num_reg_images())
     reports = []
     for model, folder in found:
         try:
-            save_run(folder, run)
             reports.append(write_report(model, folder, database, images))
         except InputError as fault:
             logger.warning("No quality report of %s: %s", folder, fault.message)

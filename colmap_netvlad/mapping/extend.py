@@ -10,7 +10,7 @@ import pycolmap
 from colmap_netvlad.colmap import engine
 from colmap_netvlad.mapping.incremental import pipeline_options
 from colmap_netvlad.mapping.options import MappingOptions
-from colmap_netvlad.mapping.output import model_folder
+from colmap_netvlad.mapping.output import Finish, as_mapped, model_folder
 from colmap_netvlad.runtime import progress
 from colmap_netvlad.runtime.errors import InputError
 
@@ -27,6 +27,16 @@ def read_model(folder: Path) -> pycolmap.Reconstruction:
         raise InputError(
             f"{folder} is not a COLMAP model (cameras, images, points3D); name one with `sparse`."
         ) from fault
+
+
+def read_models(output: Path) -> list[pycolmap.Reconstruction]:
+    """Read the models of a folder of models, in the order of their numbers.
+
+    Raises:
+        InputError: one of them cannot be read.
+    """
+    folders = [folder for folder in output.iterdir() if folder.name.isdigit()]
+    return [read_model(folder) for folder in sorted(folders, key=lambda path: int(path.name))]
 
 
 def largest_model(folders: Sequence[Path]) -> Path:
@@ -47,6 +57,7 @@ def extend_model(
     output: Path,
     candidates: int,
     options: MappingOptions = MappingOptions(),
+    finish: Finish = as_mapped,
 ) -> pycolmap.Reconstruction:
     """Continue incremental mapping from a model: register what the database's matches allow.
 
@@ -59,6 +70,7 @@ def extend_model(
         output: folder of models; it appears whole or not at all.
         candidates: images that may be registered, for the progress bar.
         options: seed and threads.
+        finish: is called with the folder of models before it gets its name.
 
     Raises:
         InputError: no model there, or `output` holds something already.
@@ -82,4 +94,5 @@ def extend_model(
             input_path=model,
             next_image_callback=bar.advance,
         )
+        finish(folder)
         return models[max(models, key=lambda index: models[index].num_reg_images())]

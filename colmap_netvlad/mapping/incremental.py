@@ -9,7 +9,7 @@ import pycolmap
 from colmap_netvlad.colmap import engine
 from colmap_netvlad.colmap.database import open_database
 from colmap_netvlad.mapping.options import MappingOptions
-from colmap_netvlad.mapping.output import model_folder
+from colmap_netvlad.mapping.output import Finish, as_mapped, model_folder
 from colmap_netvlad.mapping.priors import LOSS_SCALE, with_priors
 from colmap_netvlad.runtime import progress
 from colmap_netvlad.runtime.machine import usable_processors
@@ -20,6 +20,7 @@ def map_incremental(
     images: Path | None,
     output: Path,
     options: MappingOptions = MappingOptions(),
+    finish: Finish = as_mapped,
 ) -> list[pycolmap.Reconstruction]:
     """Reconstruct the matched images and write `output`/0, 1, ... as COLMAP does.
 
@@ -28,6 +29,7 @@ def map_incremental(
         images: photo folder, for the colours of points; None leaves them black.
         output: folder of the models; it appears whole, or not at all on a fault or Ctrl-C.
         options: seed and limits.
+        finish: is called with the folder of the models before it gets its name.
 
     Returns:
         The models in COLMAP's order; empty where nothing could be reconstructed.
@@ -52,6 +54,7 @@ def map_incremental(
             initial_image_pair_callback=lambda: bar.advance(2),
             next_image_callback=bar.advance,
         )
+        finish(folder)
     return [models[index] for index in sorted(models)]
 
 

@@ -4,12 +4,20 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from colmap_netvlad.runtime.errors import InputError
 from colmap_netvlad.runtime.files import temporary_prefix
+
+Finish = Callable[[Path], None]
+"""What is done in a folder of new models before it gets its name: killed in between, there is no
+model that lacks it."""
+
+
+def as_mapped(folder: Path) -> None:
+    """Leave models as the mapper made them: the default `Finish`."""
 
 
 @contextmanager
@@ -39,13 +47,19 @@ def model_folder(output: Path) -> Iterator[Path]:
         shutil.rmtree(temporary, ignore_errors=True)
 
 
+def outputs(output: Path) -> list[Path]:
+    """Return `output`, `<output>-2`, `-3`, ... as far as they hold something, the newest last."""
+    found, candidate = [], output
+    while candidate.exists() and (not candidate.is_dir() or any(candidate.iterdir())):
+        found.append(candidate)
+        candidate = output.with_name(f"{output.name}-{len(found) + 1}")
+    return found
+
+
 def free_output(output: Path) -> Path:
     """Return `output`, or `<output>-2`, `-3`, ... where it holds something already.
 
     A user's models are never replaced: the newest model is the folder with the highest number.
     """
-    candidate, number = output, 1
-    while candidate.exists() and (not candidate.is_dir() or any(candidate.iterdir())):
-        number += 1
-        candidate = output.with_name(f"{output.name}-{number}")
-    return candidate
+    taken = len(outputs(output))
+    return output.with_name(f"{output.name}-{taken + 1}") if taken else output

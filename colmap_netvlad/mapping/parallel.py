@@ -25,7 +25,7 @@ from colmap_netvlad.graph.viewgraph import ViewGraph, read_view_graph
 from colmap_netvlad.mapping.incremental import pipeline_options
 from colmap_netvlad.mapping.merge import merge, read_sub_model
 from colmap_netvlad.mapping.options import MappingOptions
-from colmap_netvlad.mapping.output import model_folder
+from colmap_netvlad.mapping.output import Finish, as_mapped, model_folder
 from colmap_netvlad.mapping.partition import Cluster, partition
 from colmap_netvlad.mapping.priors import with_priors, write_priors
 from colmap_netvlad.mapping.refine import load_cache, rebuild, refine
@@ -99,6 +99,7 @@ def map_parallel(
     images: Path | None,
     output: Path,
     options: MappingOptions = MappingOptions(),
+    finish: Finish = as_mapped,
 ) -> list[pycolmap.Reconstruction]:
     """Reconstruct a large flight in clusters and write `output`/0, 1, ...
 
@@ -110,6 +111,7 @@ def map_parallel(
         images: photo folder, for the colours of points; None leaves them black.
         output: folder of the models; it appears whole, or not at all on a fault or Ctrl-C.
         options: seed, threads, size of a cluster, memory.
+        finish: is called with the folder of the models before it gets its name.
 
     Returns:
         The models, largest first; empty where nothing could be reconstructed.
@@ -118,7 +120,7 @@ def map_parallel(
         InputError: `output` holds something already, or no cluster could be reconstructed
             because all of them failed.
     """
-    models, report = reconstruct_parallel(database, images, output, options)
+    models, report = reconstruct_parallel(database, images, output, options, finish)
     for line in report_lines(report):
         logger.warning(line)
     return models
@@ -129,6 +131,7 @@ def reconstruct_parallel(
     images: Path | None,
     output: Path,
     options: MappingOptions = MappingOptions(),
+    finish: Finish = as_mapped,
 ) -> tuple[list[pycolmap.Reconstruction], ParallelReport]:
     """Reconstruct in clusters (see `map_parallel`) and return models and report."""
     with model_folder(output) as folder:
@@ -138,8 +141,14 @@ def reconstruct_parallel(
         report = map_clusters(database, clusters, state, options)
         merge_clusters(database, images, state, folder, options, report)
         models = [pycolmap.Reconstruction(path) for path in _numbered(folder)]
-    shutil.rmtree(state, ignore_errors=True)
+        finish(folder)
+    forget_clusters(output)
     return models, report
+
+
+def forget_clusters(output: Path) -> None:
+    """Remove the finished clusters of models that are written."""
+    shutil.rmtree(_state(output), ignore_errors=True)
 
 
 def report_lines(report: ParallelReport) -> list[str]:
@@ -166,7 +175,7 @@ def open_state(
     It lies beside `output` and holds a fingerprint of the view graph, the clusters and what the
     clusters' mappers are told.
     """
-    state = output.parent / f".{output.name}.clusters"
+    state = _state(output)
     digest = hashlib.sha256()
     told = {
         "seed": options.seed,
@@ -378,6 +387,10 @@ def _image_count(database: Path) -> int:
 
     with open_database(database) as opened:
         return len(opened.images())
+
+
+def _state(output: Path) -> Path:
+    return output.parent / f".{output.name}.clusters"
 
 
 def _numbered(folder: Path) -> list[Path]:

@@ -15,7 +15,7 @@ from colmap_netvlad.colmap import engine
 from colmap_netvlad.colmap.database import open_database
 from colmap_netvlad.mapping.incremental import map_incremental, pipeline_options
 from colmap_netvlad.mapping.options import MappingOptions
-from colmap_netvlad.mapping.output import model_folder
+from colmap_netvlad.mapping.output import Finish, as_mapped, model_folder
 from colmap_netvlad.mapping.parallel import CLUSTER_IMAGES, map_parallel
 from colmap_netvlad.runtime import workers
 from colmap_netvlad.runtime.errors import InputError
@@ -36,12 +36,13 @@ def map_automatic(
     images: Path | None,
     output: Path,
     options: MappingOptions = MappingOptions(),
+    finish: Finish = as_mapped,
 ) -> list[pycolmap.Reconstruction]:
     """Map incrementally below `PARALLEL_IMAGES` images, in parallel from there on."""
     with open_database(database) as opened:
         count = len(opened.keypoint_counts())
     mapper = map_parallel if count >= PARALLEL_IMAGES else map_incremental
-    return mapper(database, images, output, options)
+    return mapper(database, images, output, options, finish)
 
 
 @dataclass(frozen=True)
@@ -86,6 +87,7 @@ def _map(
     images: Path | None,
     output: Path,
     options: MappingOptions = MappingOptions(),
+    finish: Finish = as_mapped,
 ) -> list[pycolmap.Reconstruction]:
     """Run a mapper that cannot be cancelled in a worker, which Ctrl-C ends."""
     with model_folder(output) as folder:
@@ -94,7 +96,10 @@ def _map(
         (outcome,) = workers.run([job], 1, lambda count: None, initialiser=engine.initialiser())
         if outcome.fault is not None:
             raise InputError(f"COLMAP could not map {how}: {outcome.fault}.")
-        return [pycolmap.Reconstruction(path) for path in sorted(folder.iterdir()) if path.is_dir()]
+        paths = [path for path in sorted(folder.iterdir()) if path.is_dir()]
+        models = [pycolmap.Reconstruction(path) for path in paths]
+        finish(folder)
+        return models
 
 
 def _write(models: dict[int, pycolmap.Reconstruction], folder: Path) -> None:

@@ -60,6 +60,7 @@ class Run:
         options: option name -> value as text.
         versions: of the programs.
         dropped: contradicted pairs that were left out before mapping.
+        source: fingerprint of what it was mapped from; empty where that is not known.
     """
 
     command: str
@@ -67,6 +68,7 @@ class Run:
     options: Mapping[str, str] = field(default_factory=dict)
     versions: Mapping[str, str] = field(default_factory=dict)
     dropped: int = 0
+    source: str = ""
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,6 @@ import time
 from pathlib import Path
 
 import kill
-import numpy as np
 
 ROOM = 2**30
 GUARD = 64 * 2**20
@@ -50,12 +49,9 @@ def ended(folder: Path, words: tuple[str, ...]) -> tuple[int, str]:
 def main() -> int:
     """Fill the disk many times and print what went wrong; 1 where anything did."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("command", choices=kill.KINDS)
-    parser.add_argument("--times", type=int, default=30)
-    parser.add_argument("--seed", type=int, default=0)
-    chosen = parser.parse_args()
-    kind, random = kill.KINDS[chosen.command], np.random.default_rng(chosen.seed)
-    refused = faults = 0
+    chosen = kill.options(parser, 30)
+    kind = kill.KINDS[chosen.command]
+    tried = refused = faults = 0
     with tempfile.TemporaryDirectory(prefix="full-") as top:
         base, disk = Path(top, "base", "project"), Path(top, "disk")
         base.mkdir(parents=True)
@@ -67,7 +63,8 @@ def main() -> int:
         wanted = kill.state(whole)
         subprocess.run(["mount", "-t", "tmpfs", f"-osize={ROOM}", "tmpfs", str(disk)], check=True)
         try:
-            for number in range(chosen.times):
+            for number, random in kill.tries(chosen):
+                tried += 1
                 folder = Path(top, f"try{number}", "project")
                 folder.parent.mkdir()
                 small = disk / f"try{number}"
@@ -90,7 +87,8 @@ def main() -> int:
                     wrong += [f"left {left}" for left in kill.left_behind(folder.resolve())]
                     resize(disk, ROOM)
                     kill.check_whole(folder.resolve())
-                    kill.run(folder, *kind.words)
+                    if not kill.finished(kind, folder):
+                        kill.run(folder, *kind.words)
                     wrong += kill.differences(kill.state(folder.resolve()), wanted)
                 except (RuntimeError, kill.sqlite3.Error) as fault:
                     wrong.append(str(fault))
@@ -101,7 +99,7 @@ def main() -> int:
                     print(f"{chosen.command} {number} (--seed {chosen.seed}):", *wrong, sep="\n  ")
         finally:
             subprocess.run(["umount", "-l", str(disk)], check=True)
-    print(f"{chosen.command}: {chosen.times} tries, {refused} refused, {faults} with faults")
+    print(f"{chosen.command}: {tried} tries, {refused} refused, {faults} with faults")
     return 1 if faults else 0
 
 

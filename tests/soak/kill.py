@@ -1,11 +1,17 @@
 """Kill commands at random moments, run them again, and compare with an undisturbed run.
 
     python tests/soak/kill.py match --times 100 --seed 0
+    python tests/soak/kill.py match --times 30 --signal INT
 
 Each try starts the command on a small rendered flight, sends SIGKILL at a random moment (to the
 command, or to it and its workers), once to three times, then lets it run to its end. Wanted are
 the same images, features, matches, pairs, figures and weights as of a run that nobody disturbed, a
 database that sqlite and COLMAP find whole after each kill, and no file left behind.
+
+With `--signal INT` (Ctrl-C: the command and its workers get it) or `TERM` (the command alone) it is
+asked to stop instead, and has to within `STOPS_WITHIN` seconds, leaving nothing behind at once.
+
+`--first NUMBER --times 1` repeats one try; `--minutes` ends a run early and says where to go on.
 """
 
 from __future__ import annotations
@@ -20,7 +26,7 @@ import sqlite3
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,10 +34,13 @@ from typing import Any
 
 import numpy as np
 
-from colmap_netvlad.cli import cli
+from colmap_netvlad.cli import main as main_of_command
 
-PAGES = ("report.html", "report.json", "run.json")
-"""Made beside a model that is there already: killed in between, `report` makes them."""
+PAGE = "report.html"
+"""The last thing that a command writes beside a model."""
+
+STOPS_WITHIN = 2.0
+"""How long a command may take to stop when asked, s."""
 
 LONGEST = 600.0
 """A run that takes longer than this hangs, s."""
@@ -47,7 +56,7 @@ class Kind:
     Attributes:
         words: its words, where {} stands for the project's folder.
         sound: prepares the folder that it starts from.
-        makes: the folder that a finished run has made, where another run makes another.
+        makes: the model that a finished run has made, where another run makes another.
     """
 
     words: tuple[str, ...]
@@ -114,6 +123,7 @@ def annotated(folder: Path) -> None:
 
 FEW = ("--max-features", "800", "--threads", "1")
 ONE = ("--mapper", "incremental", "--threads", "1")
+CLUSTERS = ("--mapper", "parallel", "--cluster-size", "5", "--threads", "1")
 DB = ("--db", "{}/project.db")
 
 KINDS = {
@@ -122,9 +132,10 @@ KINDS = {
     "pairs-bow": Kind(("pairs", *DB, "--method", "bow", "--k", "3"), features),
     "match": Kind(("match", *DB), listed),
     "match-rounds": Kind(("match", *DB, "--rounds", "2", "--k", "2", "--method", "vlad"), features),
-    "reconstruct": Kind(("reconstruct", *DB, *ONE), matched, "sparse"),
+    "reconstruct": Kind(("reconstruct", *DB, *ONE), matched, "sparse/0"),
+    "reconstruct-parallel": Kind(("reconstruct", *DB, *CLUSTERS), matched, "sparse/0"),
     "add": Kind(
-        ("add", *DB, "--images", "{}/images", "--method", "vlad", "--k", "5"), built, "sparse-2"
+        ("add", *DB, "--images", "{}/images", "--method", "vlad", "--k", "5"), built, "sparse-2/0"
     ),
     "compare": Kind(
         ("compare", *DB, "--methods", "vlad,random", "--k", "2,3", "--no-reconstruct"), features
@@ -154,10 +165,10 @@ def start(folder: Path, *words: str) -> int:
     os.dup2(log, 2)
     os.environ["TMPDIR"] = str(scratch_of(folder))
     tempfile.tempdir = None
-    sys.argv[0] = "colmap-netvlad"
+    sys.argv = ["colmap-netvlad", *(word.replace("{}", str(folder)) for word in words)]
     code = 1
     try:
-        cli([word.replace("{}", str(folder)) for word in words])
+        main_of_command()
     except SystemExit as end:
         code = end.code if isinstance(end.code, int) else 1
     finally:
@@ -188,18 +199,39 @@ def run(folder: Path, *words: str) -> float:
     raise RuntimeError(f"{words} hangs")
 
 
-def killed(folder: Path, words: tuple[str, ...], after: float, group: bool) -> bool:
-    """Start a command and kill it after some seconds; whether it was still running."""
+def killed(
+    folder: Path, words: tuple[str, ...], after: float, sent: signal.Signals, group: bool
+) -> float | None:
+    """Start a command and send it a signal after some seconds.
+
+    Returns:
+        How long it took to end, s; None where it had ended before.
+    """
     process = start(folder, *words)
     deadline = time.monotonic() + after
     while time.monotonic() < deadline:
         done, _ = os.waitpid(process, os.WNOHANG)
         if done:
-            return False
+            return None
         time.sleep(0.002)
-    (os.killpg if group else os.kill)(process, signal.SIGKILL)
-    os.waitpid(process, 0)
-    return True
+    began = time.monotonic()
+    (os.killpg if group else os.kill)(process, sent)
+    while time.monotonic() - began < LONGEST:
+        done, status = os.waitpid(process, os.WNOHANG)
+        if done:
+            log = (folder.parent / "log.txt").read_text(errors="replace")
+            if "Traceback" in log:
+                raise RuntimeError(f"{words}, {sent.name} after {after:.2f} s: {log[-2000:]}")
+            # Ended well, it was at its end when the signal came.
+            return None if status == 0 else time.monotonic() - began
+        time.sleep(0.002)
+    os.killpg(process, signal.SIGKILL)
+    raise RuntimeError(f"{words} does not end by {sent.name}")
+
+
+def finished(kind: Kind, folder: Path) -> bool:
+    """Whether a command has come to its end where another run would make another model."""
+    return bool(kind.makes) and (folder / kind.makes / PAGE).exists()
 
 
 # Comparing
@@ -218,7 +250,7 @@ def state(folder: Path) -> dict[str, Any]:
             found[name] = _figures(path.parent)
         elif path.name == "compare.json":
             found[name] = _timeless(json.loads(path.read_text()))
-        elif path.is_file() and path.name not in PAGES:
+        elif path.is_file():
             found[name] = "there"
     return found
 
@@ -256,12 +288,17 @@ def _timeless(value: Any) -> Any:
 
 
 def check_whole(folder: Path) -> None:
-    """Make sure that sqlite finds every database whole."""
+    """Make sure that sqlite finds every database whole, and COLMAP its own."""
+    import pycolmap
+
     for path in folder.rglob("*.db"):
         with closing(sqlite3.connect(path)) as connection:
             (said,) = connection.execute("PRAGMA integrity_check").fetchone()
             if said != "ok":
                 raise RuntimeError(f"{path}: {said}")
+    project = folder / "project.db"
+    if project.exists():
+        pycolmap.Database.open(project).close()
 
 
 def left_behind(folder: Path) -> list[str]:
@@ -281,49 +318,93 @@ def differences(one: dict[str, Any], other: dict[str, Any]) -> list[str]:
     ]
 
 
+def options(parser: argparse.ArgumentParser, times: int) -> argparse.Namespace:
+    """Read a soak's command line."""
+    parser.add_argument("command", choices=KINDS)
+    parser.add_argument("--times", type=int, default=times)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--first", type=int, default=0, help="begin with the try of this number")
+    parser.add_argument("--minutes", type=float, default=float("inf"), help="start no try after")
+    return parser.parse_args()
+
+
+def tries(chosen: argparse.Namespace) -> Iterator[tuple[int, np.random.Generator]]:
+    """Yield the number and the randomness of each try until the time is up."""
+    until = time.monotonic() + 60 * chosen.minutes
+    for number in range(chosen.first, chosen.first + chosen.times):
+        if time.monotonic() > until:
+            print(f"go on with --first {number} --times {chosen.first + chosen.times - number}")
+            return
+        yield number, np.random.default_rng([chosen.seed, number])
+
+
+def disturbed(
+    kind: Kind,
+    folder: Path,
+    seconds: float,
+    sent: signal.Signals,
+    random: np.random.Generator,
+) -> tuple[list[float], list[str]]:
+    """Kill or stop a command one to three times.
+
+    Returns:
+        How long it took to end, s, and what was wrong with that.
+    """
+    took, wrong = [], []
+    for _ in range(random.integers(1, 4)):
+        after = float(random.uniform(0, 1.1 * seconds))
+        both = bool(random.integers(2))
+        group = both if sent == signal.SIGKILL else sent == signal.SIGINT
+        ended = killed(folder, kind.words, after, sent, group)
+        check_whole(folder)
+        if ended is not None:
+            took.append(ended)
+        if sent != signal.SIGKILL:
+            wrong += left_behind(folder)
+            if ended is not None and ended > STOPS_WITHIN:
+                wrong.append(f"{sent.name} after {after:.2f} s: stopped within {ended:.2f} s")
+        if ended is None or finished(kind, folder):
+            break
+    return took, wrong
+
+
 def main() -> int:
     """Kill a command many times and print what went wrong; 1 where anything did."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("command", choices=KINDS)
-    parser.add_argument("--times", type=int, default=100)
-    parser.add_argument("--seed", type=int, default=0)
-    chosen = parser.parse_args()
-    kind, random = KINDS[chosen.command], np.random.default_rng(chosen.seed)
-    kills = faults = 0
+    parser.add_argument("--signal", choices=("KILL", "INT", "TERM"), default="KILL")
+    chosen = options(parser, 100)
+    kind, sent = KINDS[chosen.command], signal.Signals[f"SIG{chosen.signal}"]
+    took: list[float] = []
+    tried = faults = 0
     with tempfile.TemporaryDirectory(prefix="kill-") as top:
         base = Path(top, "base", "project")
         base.mkdir(parents=True)
         kind.sound(base)
-        for number in range(-1, chosen.times):
+        whole = Path(top, "whole", "project")
+        shutil.copytree(base, whole)
+        seconds = run(whole, *kind.words)
+        wanted = state(whole)
+        for number, random in tries(chosen):
+            tried += 1
             folder = Path(top, f"try{number}", "project")
             shutil.copytree(base, folder)
-            wrong: list[str] = []
             try:
-                if number < 0:
-                    seconds = run(folder, *kind.words)
-                    whole = state(folder)
-                    wrong = left_behind(folder)
-                else:
-                    finished = False
-                    for _ in range(random.integers(1, 4)):
-                        after = float(random.uniform(0, 1.1 * seconds))
-                        hit = killed(folder, kind.words, after, bool(random.integers(2)))
-                        kills += hit
-                        check_whole(folder)
-                        finished = bool(kind.makes) and (folder / kind.makes).exists()
-                        if finished or not hit:
-                            break
-                    if not finished:
-                        run(folder, *kind.words)
-                    wrong = differences(state(folder), whole) + left_behind(folder)
+                stops, wrong = disturbed(kind, folder, seconds, sent, random)
+                took += stops
+                if not finished(kind, folder):
+                    run(folder, *kind.words)
+                wrong += differences(state(folder), wanted) + left_behind(folder)
             except (RuntimeError, sqlite3.Error) as fault:
                 wrong = [str(fault)]
             if wrong:
                 faults += 1
                 print(f"{chosen.command} {number} (--seed {chosen.seed}):", *wrong, sep="\n  ")
             shutil.rmtree(folder.parent)
+    stopped = f", the slowest {max(took):.2f} s" if took and sent != signal.SIGKILL else ""
     print(
-        f"{chosen.command}: {chosen.times} tries, {kills} kills, {faults} with faults", flush=True
+        f"{chosen.command}: {tried} tries, {len(took)} {sent.name}{stopped}, {faults} with faults "
+        f"(undisturbed {seconds:.1f} s)",
+        flush=True,
     )
     return 1 if faults else 0
 
