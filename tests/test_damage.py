@@ -4,22 +4,25 @@ from __future__ import annotations
 
 import codecs
 import sqlite3
+import struct
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
+import numpy as np
 import pytest
 from click.testing import CliRunner
 from photos import save_jpeg, scene
 
 from colmap_netvlad.cli import cli
 from colmap_netvlad.colmap.database import image_names, open_database, pair_id
+from colmap_netvlad.graph.lookalikes import read_moves
 from colmap_netvlad.graph.verified import verified_by_name
 from colmap_netvlad.graph.viewgraph import read_view_graph
 from colmap_netvlad.pairs.lists import read_pairs
 from colmap_netvlad.photos import files
-from colmap_netvlad.photos.decode import load_batches
-from colmap_netvlad.photos.files import find_photos, leaves_folder, read_header
+from colmap_netvlad.photos.decode import decode_photo, load_batches
+from colmap_netvlad.photos.files import BadPhoto, find_photos, leaves_folder, read_header
 from colmap_netvlad.project import Project
 from colmap_netvlad.runtime.errors import InputError
 from colmap_netvlad.training.tracks import tracks
@@ -84,6 +87,43 @@ def test_damaged_matches_are_one_sentence_that_says_whose(project_copy: MakeProj
     execute(project.database, f"UPDATE two_view_geometries SET data = x'00' WHERE pair_id = {pair}")
     with pytest.raises(InputError, match=r"two_view_geometries has of image 1 \(.*\) and image 2 "):
         verified_by_name(project.database)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ("DELETE FROM keypoints WHERE image_id = 3", r"has matches of keypoint \d+ of image 3 "),
+        ("UPDATE two_view_geometries SET config = '/etc/passwd'", "two_view_geometries has of"),
+        ("UPDATE descriptors SET type = 'SIFT'", "descriptors has of"),
+    ],
+)
+def test_what_does_not_go_together_is_one_sentence(
+    change: str, said: str, project_copy: MakeProject
+) -> None:
+    project = project_copy(matched=True)
+    execute(project.database, change)
+    with open_database(project.database) as database, pytest.raises(InputError, match=said):
+        database.has_sift()
+        read_moves(database)
+
+
+def test_kinds_of_geometry_that_colmap_does_not_know_are_no_fault(
+    project_copy: MakeProject,
+) -> None:
+    project = project_copy(matched=True)
+    execute(project.database, "UPDATE two_view_geometries SET config = 99")
+    with open_database(project.database) as database:
+        assert np.isnan(read_moves(database).tilt).all()
+
+
+def test_a_small_file_that_says_it_is_huge_is_not_decoded(tmp_path: Path) -> None:
+    save_jpeg(tmp_path / "a.jpg", scene(0))
+    data = (tmp_path / "a.jpg").read_bytes()
+    start = data.index(b"\xff\xc0")
+    huge = data[: start + 5] + struct.pack(">HH", 30_000, 30_000) + data[start + 9 :]
+    (tmp_path / "a.jpg").write_bytes(huge)
+    with pytest.raises(BadPhoto, match="says 30000 x 30000 pixels, but is too small a file"):
+        decode_photo(tmp_path / "a.jpg", 64)
 
 
 @pytest.mark.parametrize(

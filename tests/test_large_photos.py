@@ -14,12 +14,12 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from colmap_netvlad.photos.files import BadPhoto, open_header, parse_header
+from colmap_netvlad.photos.files import BOMB_RATIO, BadPhoto, open_header, parse_header
 from colmap_netvlad.photos.positions import read_gps
 
 
 def png(width: int, height: int) -> bytes:
-    """A PNG file of any size that has a header and no pixels."""
+    """A PNG file of any size that has a header, and as many bytes as pixels need at the least."""
 
     def chunk(kind: bytes, data: bytes) -> bytes:
         return (
@@ -27,7 +27,10 @@ def png(width: int, height: int) -> bytes:
         )
 
     header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IEND", b"")
+    pixels = bytes(width * height // BOMB_RATIO)
+    return (
+        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", pixels) + chunk(b"IEND", b"")
+    )
 
 
 def test_a_mosaic_of_a_thousand_megapixels_is_read_without_a_warning(tmp_path: Path) -> None:

@@ -175,12 +175,15 @@ class Store:
         return any(self._db.execute(query, [model, name]).fetchone() for name in names)
 
     def seconds(self, model: str, names: Iterable[str]) -> float:
-        """Return what describing these images took when it was done, s."""
+        """Return what describing these images, which are described, took when it was done, s."""
         with self._faults():
             rows = self._db.execute(
                 "SELECT image, seconds FROM descriptors WHERE model = ?", [model]
             )
             spent = dict(rows.fetchall())
+            unknown = [name for name in names if name not in spent]
+            if unknown:
+                raise ValueError(f"it has no descriptor of {unknown[0]}")
             return float(sum(spent[name] for name in names))
 
     def vectors(self, model: str, names: Sequence[str]) -> StoredVectors:
@@ -191,7 +194,7 @@ class Store:
         """Return (B, D) descriptors of these images.
 
         Raises:
-            KeyError: one of them is not described.
+            InputError: one of them is not described.
         """
         query = "SELECT vector FROM descriptors WHERE model = ? AND image = ?"
         blobs = []
@@ -199,7 +202,7 @@ class Store:
             for name in names:
                 row = self._db.execute(query, [model, name]).fetchone()
                 if row is None:
-                    raise KeyError(name)
+                    raise ValueError(f"it has no descriptor of {name}")
                 blobs.append(row[0])
             if len({len(blob) for blob in blobs}) > 1:
                 raise ValueError("descriptors of different lengths")
@@ -226,14 +229,14 @@ class Store:
         """Return the cells of that number.
 
         Raises:
-            KeyError: there are none.
+            InputError: there are none.
         """
         with self._faults():
             row = self._db.execute(
                 "SELECT height, width, codes FROM cells WHERE number = ?", [number]
             ).fetchone()
             if row is None:
-                raise KeyError(number)
+                raise ValueError(f"it has no cells {number}")
             height, width, codes = row
             return Cells(np.frombuffer(codes, np.int8).reshape(height, width, -1))
 

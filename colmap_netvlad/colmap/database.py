@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -188,12 +188,20 @@ class Database:
         return values
 
     def has_sift(self) -> bool:
-        """Whether there are SIFT descriptors and no others."""
+        """Whether there are SIFT descriptors and no others.
+
+        Raises:
+            InputError: what the database says of their kind is damaged.
+        """
         known = "type" in self._columns("descriptors")
         kind = "MAX(type)" if known else str(SIFT_TYPE)
         longest, shortest, kind = self.connection.execute(
             f"SELECT MAX(cols), MIN(cols), {kind} FROM descriptors WHERE rows > 0"
         ).fetchone()
+        if kind is None:
+            return False  # there are none
+        if not isinstance(kind, int):
+            raise self._damaged("descriptors", "an image's kind of features")
         return longest == shortest == SIFT_BYTES and kind <= SIFT_TYPE
 
     def feature_fingerprints(self) -> dict[int, str]:
@@ -254,20 +262,30 @@ class Database:
         """Return (M, 2) keypoint indices of the verified matches, columns as the ids are given.
 
         Raises:
-            InputError: they are damaged.
+            InputError: they are damaged, or of keypoints that an image does not have.
         """
         pair = pair_id(image_id1, image_id2)
         matches = self._values("two_view_geometries", "pair_id", pair, np.uint32, 2)
+        if len(matches):
+            self._check_keypoints(images_of_pair(pair), matches.max(axis=0).tolist())
         return matches if image_id1 <= image_id2 else matches[:, ::-1]
 
     def geometry(self, image_id1: int, image_id2: int) -> PairGeometry | None:
-        """Return the two-view geometry of a pair, ids ascending; None where it was not verified."""
+        """Return the two-view geometry of a pair, ids ascending; None where it was not verified.
+
+        Raises:
+            InputError: it is damaged.
+        """
         row = self.connection.execute(
             "SELECT config, F, E, H FROM two_view_geometries WHERE pair_id = ? AND rows > 0",
             (pair_id(image_id1, image_id2),),
         ).fetchone()
         if row is None:
             return None
+        if not isinstance(row[0], int):
+            raise self._damaged(
+                "two_view_geometries", f"{self._image(image_id1)} and {self._image(image_id2)}"
+            )
         return PairGeometry(row[0], *(_matrix(blob) for blob in row[1:]))
 
     def pose_priors(self) -> dict[int, PosePrior]:
@@ -378,6 +396,22 @@ class Database:
         if row is not None:
             whose = images_of_pair(row[0]) if key == "pair_id" else (row[0],)
             raise self._damaged(table, " and ".join(map(self._image, whose)))
+
+    def _check_keypoints(self, images: tuple[int, int], last: Sequence[int]) -> None:
+        """Make sure that two images have the keypoints that their matches name last."""
+        rows = dict(
+            self.connection.execute(
+                "SELECT image_id, rows FROM keypoints WHERE image_id IN (?, ?)", images
+            )
+        )
+        for image, index in zip(images, last, strict=True):
+            count = rows.get(image, 0)
+            if not isinstance(count, int) or index >= count:
+                raise InputError(
+                    f"{self.path} has matches of keypoint {index} of {self._image(image)}, which "
+                    f"has {count}: its features and its matches are not of one run; delete the "
+                    "matches, or restore the database from a copy."
+                )
 
     def _image(self, number: int) -> str:
         row = self.connection.execute(

@@ -305,17 +305,17 @@ def _tilt(
     if kept is None:
         return np.nan
     geometry = pycolmap.TwoViewGeometry()
-    geometry.config = pycolmap.TwoViewGeometryConfiguration(kept.config)
     for name in ("F", "E", "H"):
         if getattr(kept, name) is not None:
             setattr(geometry, name, getattr(kept, name))
     count = np.arange(len(first), dtype=np.uint32)
     geometry.inlier_matches = np.column_stack([count, count])
     try:
+        geometry.config = pycolmap.TwoViewGeometryConfiguration(kept.config)
         known = pycolmap.estimate_two_view_geometry_pose(
             one, first.astype(np.float64), two, second.astype(np.float64), geometry
         )
-    except (ValueError, RuntimeError):  # no matrix of the kind that it needs
+    except (ValueError, RuntimeError):  # no such kind, or no matrix that it needs
         return np.nan
     if not known or geometry.cam2_from_cam1 is None:
         return np.nan

@@ -45,6 +45,11 @@ PNG_TAIL_BYTES = 4096
 MOST_PIXELS = 2**30
 """Photos with more pixels than this cannot be decoded: it is OpenCV's limit."""
 
+BOMB_PIXELS = 2**26
+BOMB_RATIO = 1000
+"""A photo of more pixels than `BOMB_PIXELS`, 200 MB decoded, has a byte for `BOMB_RATIO` of them at
+least: no codec says less of what is a photo."""
+
 _OPENING = threading.Lock()
 
 
@@ -215,6 +220,9 @@ def parse_header(file: BinaryIO) -> PhotoHeader:
         raise BadPhoto("is truncated (the PNG data end early)")
     if header.width * header.height > MOST_PIXELS:
         raise BadPhoto(f"has {header.width} x {header.height} pixels, more than can be decoded")
+    pixels = header.width * header.height
+    if pixels > max(BOMB_PIXELS, BOMB_RATIO * file.seek(0, os.SEEK_END)):
+        raise BadPhoto(f"says {header.width} x {header.height} pixels, but is too small a file")
     if min(header.width, header.height) < MIN_SIDE:
         raise BadPhoto(f"is only {header.width} x {header.height} pixels")
     return header

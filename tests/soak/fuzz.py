@@ -263,7 +263,9 @@ def photo(random: Random, base: Base, folder: Path) -> str:
             ended["refused"] += 1
     if random.integers(5) == 0:
         shutil.copy(base.photos[0], images / "sound.jpg")
-        found = command("features", "--images", images, "--db", folder / "p.db", "--threads", 1)
+        # SIFT itself takes 2 GiB of a sound photo of 13 megapixels.
+        found = command("features", "--images", images, "--db", folder / "p.db", "--threads", 1,
+                        "--max-image-size", 800)  # fmt: skip
         return f"features {found}"
     return "read" if not ended["refused"] else "refused"
 
