@@ -122,7 +122,7 @@ def features(images: Path, database: Path, features: FeatureOptions, masks: Path
     from colmap_netvlad.commands.features import import_photos, report_lines
 
     report = import_photos(images, database, replace(features, masks=masks))
-    say(*report_lines(report, database))
+    say(*report_lines(report, images, database))
     words = ["colmap-netvlad", "pairs", "--db", str(database)]
     click.echo(f"Next: {command_line(words)}")
     finish_partial([f"Left out: {name} {reason}" for name, reason in report.bad])

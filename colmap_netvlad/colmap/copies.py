@@ -119,6 +119,16 @@ def copy_features(source: Path, target: Path, aliases: Mapping[int, str]) -> Non
         new.commit()
 
 
+def keep_images(copy: Path, ids: Collection[int]) -> None:
+    """Delete all images but some, with their features, from a copy that is to be searched."""
+    with closing(sqlite3.connect(copy)) as database:
+        database.execute("CREATE TEMP TABLE kept (image_id INTEGER PRIMARY KEY)")
+        database.executemany("INSERT INTO kept VALUES (?)", [(i,) for i in ids])
+        for table in (*FEATURES, "images"):
+            database.execute(f"DELETE FROM {table} WHERE image_id NOT IN kept")
+        database.commit()
+
+
 def copy_matches(source: Path, target: Path, pairs: Collection[int]) -> None:
     """Copy the results of some pairs, by their ids, whole or not at all.
 

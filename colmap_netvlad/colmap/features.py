@@ -18,6 +18,7 @@ import pycolmap
 
 from colmap_netvlad.colmap import engine
 from colmap_netvlad.colmap.database import ImageRow, open_database
+from colmap_netvlad.photos.bands import lens_band
 from colmap_netvlad.photos.files import (
     PHOTO_SUFFIXES,
     BadPhoto,
@@ -88,7 +89,7 @@ CameraKey = tuple[object, ...]
 
 def _same_lens(name: str, header: PhotoHeader) -> CameraKey:
     origin = header.lens or str(PurePosixPath(name).parent)
-    return origin, header.serial, header.width, header.height
+    return origin, header.serial, lens_band(name, header.band), header.width, header.height
 
 
 CAMERA_MODES: dict[str, Callable[[str, PhotoHeader], CameraKey]] = {
@@ -99,10 +100,10 @@ CAMERA_MODES: dict[str, Callable[[str, PhotoHeader], CameraKey]] = {
 }
 """Camera mode -> what photos of one camera have in common.
 
-`auto`: EXIF make, model and focal length, serial number, and size: two drones of one model are two
-cameras; without these tags folder and size. COLMAP's
-own automatic mode gives every photo without EXIF a camera of its own, which makes hundreds of
-focal lengths of one drone's camera, each badly determined.
+`auto`: EXIF make, model and focal length, serial number, band, and size: two drones of one model
+are two cameras, and so are two lenses of a multispectral one; without these tags folder and size.
+COLMAP's own automatic mode gives every photo without EXIF a camera of its own, which makes hundreds
+of focal lengths of one drone's camera, each badly determined.
 """
 
 

@@ -6,6 +6,8 @@ from pathlib import Path
 
 from colmap_netvlad.cache.store import Store
 from colmap_netvlad.colmap.features import FeatureOptions, FeatureReport, extract_features
+from colmap_netvlad.photos.files import find_photos
+from colmap_netvlad.photos.shutters import find_rolling_shutters
 from colmap_netvlad.project import Project
 
 DEFAULT_OPTIONS = FeatureOptions()
@@ -28,10 +30,12 @@ def import_photos(
     return report
 
 
-def report_lines(report: FeatureReport, database: Path) -> list[str]:
-    """Return what `colmap-netvlad features` prints of it."""
+def report_lines(report: FeatureReport, images: Path, database: Path) -> list[str]:
+    """Return what `colmap-netvlad features` prints: what was done, and rolling shutters."""
+    shutters = find_rolling_shutters(images, find_photos(images))
     return [
         f"Photos: {report.photos:,}, {report.already:,} with features before, "
         f"{report.extracted:,} extracted now ({report.features:,} features), "
-        f"{report.cameras:,} camera{'s' if report.cameras != 1 else ''} in {database}."
+        f"{report.cameras:,} camera{'s' if report.cameras != 1 else ''} in {database}.",
+        *(shutter.sentence() for shutter in shutters),
     ]

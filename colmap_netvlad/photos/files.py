@@ -7,7 +7,7 @@ import os
 import struct
 import threading
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -35,6 +35,11 @@ XMP_SERIAL_NUMBERS = (
     "drone-dji:DroneSerialNumber",
 )
 """Where XMP tells one camera from another of the same model, best first."""
+
+XMP_EXPOSURES = ("drone-dji:CaptureUUID", "MicaSense:CaptureId", "Camera:CaptureUUID")
+"""Where XMP states the number that all bands of a shot have in common."""
+
+XMP_BAND = "Camera:BandName"
 
 FINGERPRINT_BLOCKS = 8
 FINGERPRINT_BLOCK_BYTES = 16 * 1024
@@ -68,6 +73,8 @@ class PhotoHeader:
         serial: number of the camera or, where that is not told, of the drone: EXIF's
             BodySerialNumber, else XMP.
         day: when the photo was taken, `YYYY:MM:DD` of EXIF.
+        exposure: number of the shot that a multispectral camera's bands have in common, of XMP.
+        band: which band of it the photo is, of XMP.
     """
 
     width: int
@@ -75,6 +82,8 @@ class PhotoHeader:
     lens: tuple[str, str, float] | None
     serial: str | None = None
     day: str | None = None
+    exposure: str | None = None
+    band: str | None = None
 
 
 def find_photos(folder: Path) -> list[str]:
@@ -207,8 +216,15 @@ def parse_header(file: BinaryIO) -> PhotoHeader:
         raise BadPhoto("is empty")
     try:
         with open_header(file) as photo:
+            xmp = properties(photo)
             header = PhotoHeader(
-                photo.width, photo.height, _lens(photo), _serial(photo), _day(photo)
+                photo.width,
+                photo.height,
+                _lens(photo),
+                _serial(photo, xmp),
+                _day(photo),
+                next((xmp[key] for key in XMP_EXPOSURES if xmp.get(key)), None),
+                xmp.get(XMP_BAND) or None,
             )
     except UnidentifiedImageError as fault:
         raise BadPhoto("is not a photo") from fault
@@ -278,9 +294,8 @@ def _jpeg_is_whole(file: BinaryIO) -> bool:
     return False
 
 
-def _serial(photo: Image.Image) -> str | None:
+def _serial(photo: Image.Image, xmp: Mapping[str, str]) -> str | None:
     said = _detail(photo, BODY_SERIAL_NUMBER)
-    xmp = properties(photo)
     return next((one for one in (said, *map(xmp.get, XMP_SERIAL_NUMBERS)) if one), None)
 
 

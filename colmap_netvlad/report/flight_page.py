@@ -117,6 +117,7 @@ def render_flight_page(quality: Quality, checks: Sequence[Check]) -> str:
         regions=_regions(quality),
         cameras=list(quality.cameras)[:CAMERAS_SHOWN],
         all_cameras=len(quality.cameras),
+        shutters=_shutters(quality),
         thumbnail=Thumbnails(quality.source.images),
         facts=Markup(_json(facts)),
         columns=[(title, COLUMNS[title]) for title, *_ in facts["columns"]],
@@ -184,6 +185,13 @@ def _residual_rows(quality: Quality) -> list[tuple[str, float, float, float]]:
     )
     # Adding zero turns a rounded -0.0 into 0.0.
     return [(title, *(np.round(values, 2) + 0.0).tolist()) for title, values in rows]
+
+
+def _shutters(quality: Quality) -> list[str]:
+    """Say what rolling shutters cost, in pixels where the ground sample distance is known."""
+    known = quality.pixel[np.isfinite(quality.pixel)]
+    pixel = float(np.median(known)) if quality.frame.metric and len(known) else None
+    return [shutter.sentence(pixel) for shutter in quality.shutters]
 
 
 def _overlap(quality: Quality) -> Picture | None:

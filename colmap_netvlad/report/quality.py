@@ -24,6 +24,7 @@ from colmap_netvlad.graph.viewgraph import (
     edge_weights,
     weigh_database,
 )
+from colmap_netvlad.photos.shutters import RollingShutter, find_rolling_shutters
 from colmap_netvlad.report.cameras import CameraReport, camera_reports
 from colmap_netvlad.report.contradictions import with_model
 from colmap_netvlad.report.ground import (
@@ -149,6 +150,7 @@ class Quality:
         corners: (N, 4, 2) footprints, page units.
         overlap: photos a ground cell, or None where footprints mean nothing.
         cameras: each camera that took a registered image.
+        shutters: rolling shutters among them.
         graph: the view graph: of verified matches where there is a database, else of common
             points.
         verified: whether it is of verified matches.
@@ -165,6 +167,7 @@ class Quality:
     corners: Floats
     overlap: Overlap | None
     cameras: Sequence[CameraReport]
+    shutters: Sequence[RollingShutter]
     graph: ViewGraph
     verified: bool
     links: GraphStatistics
@@ -234,8 +237,9 @@ def measure(source: Source) -> Quality:
     if source.images is None:
         not_shown.append("There is no photo folder: photos are not shown.")
     cameras = camera_reports(model, data, frame, initial) if len(data.names) else []
+    shutters = find_rolling_shutters(source.images, data.names) if source.images else []
     return Quality(
-        source, data, frame, pixel, corners, overlap, cameras, graph,
+        source, data, frame, pixel, corners, overlap, cameras, shutters, graph,
         source.database is not None, within(graph, set(data.names)).statistics(), lookalikes,
         missing, not_shown,
     )  # fmt: skip

@@ -9,6 +9,7 @@ from colmap_netvlad.cache.ranking import Ranking
 from colmap_netvlad.flight import Flight, open_flight
 from colmap_netvlad.photos.positions import Positions
 from colmap_netvlad.project import Project
+from colmap_netvlad.retrieval.bands import for_bands, multispectral_shots, of_shots
 from colmap_netvlad.retrieval.gps import near_first
 from colmap_netvlad.retrieval.methods import Method, deep, find_method, hdf5
 from colmap_netvlad.retrieval.options import (
@@ -32,6 +33,8 @@ def rank(
 ) -> Ranking:
     """Rank the images of a flight by a method of the table, or by `options.model` if given.
 
+    A multispectral flight is ranked by one band of each shot (`retrieval.bands`).
+
     It is done once and deep enough for all that follows: the ranking lists `ranking_depth(k)`
     partners of each image (or all others); who wants k of them cuts it (`Ranking.top`). A `k`
     above the number of other images is lowered to it; the ranking's notes say so.
@@ -46,6 +49,15 @@ def rank(
     if options.rerank < 0:
         raise InputError(f"`rerank` is {options.rerank}; it is a number of candidates, 0 for none.")
     method = _method(name, options)
+    # The baselines are of images: all pairs, and pairs by chance.
+    shots = multispectral_shots(flight) if method.needs else None
+    if shots is None:
+        return _rank(flight, method, options, least_depth)
+    ranking = _rank(of_shots(flight, shots), method, options, least_depth)
+    return for_bands(ranking, shots, flight.names)
+
+
+def _rank(flight: Flight, method: Method, options: RetrievalOptions, least_depth: int) -> Ranking:
     others = len(flight.images) - 1
     k = check_k(options.k, len(flight.images))
     depth = min(max(ranking_depth(k), least_depth), others)

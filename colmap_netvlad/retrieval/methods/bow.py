@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_netvlad.cache.ranking import NO_PARTNER, Ranking
-from colmap_netvlad.colmap.copies import copy_database
+from colmap_netvlad.colmap.copies import copy_database, keep_images
 from colmap_netvlad.flight import Flight
 from colmap_netvlad.retrieval.methods.vlad import NO_FEATURES, sample_descriptors
 from colmap_netvlad.retrieval.options import RetrievalOptions
@@ -65,6 +65,7 @@ def candidates(flight: Flight, options: RetrievalOptions, depth: int) -> Ranking
     with scratch_folder() as folder:
         features = folder / "features.db"
         copy_database(flight.project.database, features, matches=False)
+        keep_images(features, rows)
         answer = folder / "answer.npz"
         arguments = answer, features, tree, rows, frozenset(described), depth
         _apart("Asking the vocabulary tree", len(rows), _query, *arguments)
