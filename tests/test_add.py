@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 
+import numpy as np
+import pycolmap
 import pytest
 
 from colmap_netvlad.colmap.database import image_names, open_database
 from colmap_netvlad.colmap.features import FeatureOptions, extract_features
 from colmap_netvlad.commands import add
-from colmap_netvlad.commands.add import AddOptions, add_photos, newest_model
+from colmap_netvlad.commands.add import AddOptions, add_lines, add_photos, newest_model
+from colmap_netvlad.commands.georegister import georegister_in_place
 from colmap_netvlad.demo.render import RenderedFlight
+from colmap_netvlad.geo.georeference import read_frame
+from colmap_netvlad.geo.places import find_places
 from colmap_netvlad.mapping.incremental import map_incremental
 from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.matching.options import MatchOptions
@@ -83,6 +89,43 @@ def test_new_photos_join_the_model_and_only_their_pairs_are_matched(
 
     with pytest.raises(InputError, match="no new photos"):
         add_photos(project, newest_model(project), OPTIONS)
+
+
+def centres(folder: Path) -> dict[str, np.ndarray]:
+    model = pycolmap.Reconstruction(folder)
+    images = (model.image(image_id) for image_id in model.reg_image_ids())
+    return {image.name: image.projection_center() for image in images}
+
+
+@pytest.mark.parametrize("adjusted", [False, True])
+def test_a_model_in_the_world_stays_there(
+    reconstructed: tuple[Project, list[Path]], flight: RenderedFlight, adjusted: bool
+) -> None:
+    """The rendered photos' EXIF positions are exact, and those of new photos lie to one side."""
+    project, photos = reconstructed
+    assert project.images is not None
+    places = find_places(image_names(project.database), project.database, project.images)
+    (placed,) = georegister_in_place(project.sparse, places)
+    assert placed.georeference is not None
+    replace(placed.georeference, adjusted=adjusted).write(project.sparse / "0")
+    frame, before = read_frame(project.sparse / "0"), centres(project.sparse / "0")
+    for photo in photos:
+        shutil.copy(photo, project.images / photo.name)
+
+    report = add_photos(project, newest_model(project), OPTIONS)
+
+    assert read_frame(report.output / "0") == frame
+    after = centres(report.output / "0")
+    assert max(np.linalg.norm(after[name] - place) for name, place in before.items()) < 1.0
+    known = find_places(list(after), None, project.images, frame)
+    apart = np.linalg.norm(np.array(list(after.values())) - known.metres, axis=1)
+    assert len(apart) == len(flight.names) and apart.max() < 1.0
+    told = json.loads((report.output / "0/georeference.json").read_text())
+    assert told["adjusted_with_positions"] is adjusted
+    assert set(told["photos"]) == set(flight.names)
+    said = "\n".join(add_lines(report))
+    assert "Photos were added; those the model had stayed where they were." in said
+    assert [path.name for path in report.output.iterdir()] == ["0"]
 
 
 def test_photos_in_a_folder_of_their_own_are_refused_before_anything_is_written(

@@ -14,6 +14,7 @@ from colmap_netvlad.cache.ranking import NO_PARTNER, Ranking
 from colmap_netvlad.cache.store import Store
 from colmap_netvlad.colmap.database import image_names, open_database
 from colmap_netvlad.colmap.features import FeatureOptions, FeatureReport, extract_features
+from colmap_netvlad.commands.georegister import Placed, keep_place
 from colmap_netvlad.commands.report import (
     FlightReport,
     made_before,
@@ -22,9 +23,12 @@ from colmap_netvlad.commands.report import (
     run_of,
     save_runs,
 )
+from colmap_netvlad.geo.georeference import Place, read_place
+from colmap_netvlad.geo.places import find_deviations, find_places
 from colmap_netvlad.mapping.extend import extend_model, largest_model, read_model
 from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.mapping.output import free_output
+from colmap_netvlad.mapping.priors import PositionPriors
 from colmap_netvlad.mapping.summary import ModelSummary, registered_names, summarize
 from colmap_netvlad.matching.options import MatchOptions, MatchReport, given_up_words
 from colmap_netvlad.matching.run import match_pairs
@@ -88,6 +92,7 @@ class AddReport:
         unregistered: new photos without a pose in the model.
         seconds: duration by stage, s.
         quality: the extended model's quality report.
+        placed: where it is in the world; None where the model given was nowhere.
     """
 
     new: list[str]
@@ -99,6 +104,7 @@ class AddReport:
     unregistered: list[str]
     seconds: dict[str, float]
     quality: list[FlightReport] = field(default_factory=list)
+    placed: Placed | None = None
 
 
 def add_photos(
@@ -110,8 +116,9 @@ def add_photos(
     """Import the photos the database does not have, and register them into a model.
 
     Features, descriptors, pairs, matches and poses are computed for the new photos alone; pairs
-    are between a new photo and an old one. The model given is left as it is. Where it was stopped,
-    it goes on with the same photos.
+    are between a new photo and an old one. The model given is left as it is; where it is in the
+    world, the larger one is in the same frame. Where it was stopped, it goes on with the same
+    photos.
 
     Args:
         project: its photo folder holds the new photos beside the old ones; its database gets
@@ -156,8 +163,15 @@ def add_photos(
     with open_database(project.database) as database:
         run = replace(run, source=database.verified_fingerprint())
 
+    place, placed = read_place(model), None
+    priors = _priors(project, place) if place is not None and place.adjusted else None
+
     def finish(models: Path) -> None:
-        """Note how the model was made."""
+        """Bring the model to where the one given is, and note how it was made."""
+        nonlocal placed
+        if place is not None:
+            adjusted = priors is not None
+            placed = keep_place(model, models / "0", project.database, folder, adjusted=adjusted)
         seconds["mapping"] = time.monotonic() - start
         save_runs(models, replace(run, seconds=seconds))
 
@@ -167,7 +181,7 @@ def add_photos(
         seconds["mapping"] = 0.0
     else:
         target = free_output(output or project.sparse)
-        mapping = MappingOptions(seed=options.seed)
+        mapping = MappingOptions(seed=options.seed, priors=priors)
         after = extend_model(project.database, folder, model, target, len(usable), mapping, finish)
     quality = report_models(target, project.database, folder)
     registered = registered_names([after])
@@ -182,7 +196,16 @@ def add_photos(
         unregistered=[name for name in usable if name not in registered],
         seconds=seconds,
         quality=quality,
+        placed=placed,
     )
+
+
+def _priors(project: Project, place: Place) -> PositionPriors:
+    """Return the positions of all photos in the frame of a model that was adjusted with them."""
+    names = image_names(project.database)
+    places = find_places(names, project.database, project.images, place.frame)
+    deviations, _ = find_deviations(names, project.database, project.images)
+    return PositionPriors(places.names, places.metres, deviations)
 
 
 def add_lines(report: AddReport) -> list[str]:
@@ -205,6 +228,8 @@ def add_lines(report: AddReport) -> list[str]:
             f"Not registered: {listed(report.unregistered)}; photos that overlap only other "
             "new ones need `among_new`, or new pairs and a new model."
         )
+    if report.placed is not None:
+        lines += report.placed.lines()
     return [*lines, f"The extended model is in {report.output}."]
 
 

@@ -21,8 +21,9 @@ from colmap_netvlad.geo.gcp import (
     measure_control,
     read_control,
 )
-from colmap_netvlad.geo.georeference import Georeference, transformed
+from colmap_netvlad.geo.georeference import Georeference, read_place, transformed
 from colmap_netvlad.geo.places import Places, find_places
+from colmap_netvlad.mapping.merge import Refused, read_sub_model, shared_points, similarity
 from colmap_netvlad.mapping.output import free_output, model_folder
 from colmap_netvlad.project import DATABASE_NAMES
 from colmap_netvlad.runtime.errors import InputError
@@ -194,6 +195,54 @@ def georegister_in_place(
             shutil.rmtree(draft, ignore_errors=True)
         placed.append(one)
     return placed
+
+
+def keep_place(
+    before: Path, after: Path, database: Path, images: Path | None, *, adjusted: bool
+) -> Placed:
+    """Bring a model that was made by enlarging another to where that one is, in place.
+
+    What both have stays where it was: the frame is the old one, and its origin too.
+
+    Args:
+        before: folder of the model that was enlarged; it is in the world.
+        after: folder of the larger one, over images of the same database.
+        database: for position priors.
+        images: photo folder, for EXIF GPS.
+        adjusted: the larger one was adjusted with positions in the old frame, and so is in it.
+    """
+    place = read_place(before)
+    assert place is not None
+    model = read_model(after)
+    moved = pycolmap.Sim3d()
+    if not adjusted:
+        old, new = (
+            read_sub_model(name, read_model(Path(name))) for name in (str(before), str(after))
+        )
+        try:
+            moved = similarity(old, new, shared_points(old, new))
+        except Refused as refusal:
+            return Placed(
+                after.name, None, f"it does not lie as the model it grew from: {refusal}."
+            )
+    model.transform(moved)
+    names, centres, _ = _poses(model)
+    places = find_places(names, database, images, place.frame)
+    notes = ["Photos were added; those the model had stayed where they were."]
+    if place.control:
+        notes.append(
+            "Ground points placed it before; `colmap-netvlad georegister` with `gcp` measures them "
+            "again."
+        )
+    lying = as_it_lies(names, centres, places.of(names))
+    alignment = replace(lying, world_from_model=moved, notes=tuple(notes))
+    georeference = Georeference(place.frame, alignment, adjusted)
+    with tempfile.TemporaryDirectory(prefix=temporary_prefix(after), dir=after.parent) as temporary:
+        model.write(temporary)
+        georeference.write(Path(temporary))
+        for file in sorted(Path(temporary).iterdir()):
+            file.replace(after / file.name)
+    return Placed(after.name, georeference)
 
 
 def place_model(

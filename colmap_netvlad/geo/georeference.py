@@ -108,24 +108,55 @@ class Georeference:
         }
 
 
+@dataclass(frozen=True)
+class Place:
+    """What `georeference.json` says of how a model came where it is.
+
+    Attributes:
+        frame: its frame; None: the cartesian system of the database's priors.
+        adjusted: whether the positions were part of the bundle adjustment.
+        control: whether ground points placed it.
+    """
+
+    frame: LocalFrame | None
+    adjusted: bool
+    control: bool
+
+
+def read_place(folder: Path) -> Place | None:
+    """Return where a model is, or None where it is not in the world.
+
+    Raises:
+        InputError: `georeference.json` is damaged.
+    """
+    path = folder / FILE
+    if not path.is_file():
+        return None
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        origin, frame = content["origin"], None
+        if origin is not None:
+            frame = LocalFrame(*(float(origin[key]) for key in ("latitude", "longitude", "height")))
+        adjusted = bool(content.get("adjusted_with_positions"))
+        return Place(frame, adjusted, content.get("ground_points") is not None)
+    except (ValueError, KeyError, TypeError, AttributeError) as fault:
+        raise InputError(f"{path} is damaged; run `colmap-netvlad georegister` again.") from fault
+
+
 def read_frame(folder: Path) -> LocalFrame:
     """Return the frame of a georegistered model.
 
     Raises:
         InputError: the model is not georegistered, or not to geographic positions.
     """
-    path = folder / FILE
-    if not path.is_file():
+    place = read_place(folder)
+    if place is None:
         raise InputError(
             f"{folder} has no {FILE}: the model is not in the world yet; run "
             "`colmap-netvlad georegister` first."
         )
-    try:
-        origin = json.loads(path.read_text(encoding="utf-8"))["origin"]
-        if origin is not None:
-            return LocalFrame(*(float(origin[key]) for key in ("latitude", "longitude", "height")))
-    except (ValueError, KeyError, TypeError) as fault:
-        raise InputError(f"{path} is damaged; run `colmap-netvlad georegister` again.") from fault
+    if place.frame is not None:
+        return place.frame
     raise InputError(
         f"The model in {folder} is in a cartesian system of its own, which has no place on the "
         "globe; positions in latitude and longitude are needed."

@@ -59,7 +59,12 @@ class Places:
         return found
 
 
-def find_places(names: Sequence[str], database: Path | None, images: Path | None) -> Places:
+def find_places(
+    names: Sequence[str],
+    database: Path | None,
+    images: Path | None,
+    frame: LocalFrame | None = None,
+) -> Places:
     """Look up the positions of photos: the database's priors first, then EXIF GPS.
 
     What cannot be right is put aside and said (see `photos.positions.place`).
@@ -68,14 +73,16 @@ def find_places(names: Sequence[str], database: Path | None, images: Path | None
         names: of the photos, relative to `images`.
         database: COLMAP database, or None where there is none.
         images: photo folder, or None where it is not known.
+        frame: the frame of the positions; None: one in their middle.
     """
     positions = place(find_priors(names, database, images), names)
     if positions.geographic is None:
         return Places(tuple(names), positions.metres, None, positions.notes)
     if not positions.known.any():
         nowhere = np.full((len(names), 3), np.nan)
-        return Places(tuple(names), nowhere, None, positions.notes)
-    return in_frame(names, positions.geographic, frame_of(positions.geographic), positions.notes)
+        return Places(tuple(names), nowhere, frame, positions.notes)
+    frame = frame or frame_of(positions.geographic)
+    return in_frame(names, positions.geographic, frame, positions.notes)
 
 
 def in_frame(

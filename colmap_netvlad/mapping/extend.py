@@ -11,6 +11,7 @@ from colmap_netvlad.colmap import engine
 from colmap_netvlad.mapping.incremental import pipeline_options
 from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.mapping.output import Finish, as_mapped, model_folder
+from colmap_netvlad.mapping.priors import with_priors
 from colmap_netvlad.runtime import progress
 from colmap_netvlad.runtime.errors import InputError
 
@@ -69,7 +70,7 @@ def extend_model(
         model: folder of the existing model.
         output: folder of models; it appears whole or not at all.
         candidates: images that may be registered, for the progress bar.
-        options: seed and threads.
+        options: seed, threads, and positions in the model's frame where it was adjusted with such.
         finish: is called with the folder of models before it gets its name.
 
     Raises:
@@ -80,6 +81,7 @@ def extend_model(
     pipeline.multiple_models = False
     with (
         model_folder(output) as folder,
+        with_priors(database, options.priors, folder.parent) as source,
         progress.step("Registering images", candidates) as bar,
     ):
         # Continuing a model, COLMAP writes straight into its output folder.
@@ -87,7 +89,7 @@ def extend_model(
         models = engine.call(
             pycolmap.incremental_mapping,
             folder,
-            database,
+            source,
             images or folder,
             folder / "0",
             options=pipeline,
