@@ -78,6 +78,7 @@ def test_a_model_lies_where_its_gps_says(mapped: Mapped, tmp_path: Path) -> None
     assert told["residuals"]["horizontal_rms"] == pytest.approx(NOISE * 2**0.5, rel=0.4)
     assert told["residuals"]["photos"] == len(told["photos"]) == len(mapped.truth)
     assert "EPSG 32630" in result.output
+    assert "Heights are as the photos state them; no geoid model is applied." in result.output
     assert before == {path: path.read_bytes() for path in (mapped.folder / "sparse/0").iterdir()}
 
 
@@ -192,6 +193,40 @@ def test_one_bad_position_disables_nothing(
     assert said in result.output
     written = sparse.with_name("sparse-georegistered") / "0"
     assert np.sqrt((errors(written, mapped.truth) ** 2).mean()) < NOISE
+
+
+@pytest.mark.parametrize("without", [1, 18])
+def test_photos_without_heights(mapped: Mapped, tmp_path: Path, without: int) -> None:
+    images = with_photos(tmp_path, mapped.truth, FRAME)
+    for photo in sorted(images.iterdir())[:without]:
+        with Image.open(photo) as opened:
+            exif = opened.getexif()
+            gps = exif.get_ifd(0x8825)
+            exif[0x8825] = {tag: value for tag, value in gps.items() if tag not in (5, 6)}
+            opened.load()
+            opened.save(photo, exif=exif)
+    shutil.copytree(mapped.folder / "sparse/0", tmp_path / "models/0")
+    result = run("georegister", "--sparse", tmp_path / "models", "--images", images)
+    assert result.exit_code == 0, result.output
+    assert ("taken to be level" in result.output) == (without == 18)
+    apart = errors(tmp_path / "models-georegistered/0", mapped.truth)
+    assert np.sqrt((apart[:, :2] ** 2).mean()) < NOISE
+    assert without == 18 or np.sqrt((apart[:, 2] ** 2).mean()) < NOISE
+
+
+def test_names_with_spaces_and_umlauts(mapped: Mapped, tmp_path: Path) -> None:
+    model = pycolmap.Reconstruction(mapped.folder / "sparse/0")
+    for image in model.images.values():
+        image.name = f"Flug ü 1/{image.name}"
+    folder = tmp_path / "Modell ß"
+    folder.mkdir()
+    model.write(folder)
+    truth = {f"Flug ü 1/{name}": place for name, place in mapped.truth.items()}
+    images = with_photos(tmp_path, mapped.truth, FRAME)
+    shutil.move(images, tmp_path / "images/Flug ü 1")
+    result = run("georegister", "--sparse", folder, "--images", tmp_path / "images")
+    assert result.exit_code == 0, result.output
+    assert np.sqrt((errors(tmp_path / "Modell ß-georegistered", truth) ** 2).mean()) < NOISE
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from scipy.spatial import KDTree
 
 from colmap_netvlad.cache.ranking import Ranking
 from colmap_netvlad.cli import cli
+from colmap_netvlad.colmap.copies import copy_images
 from colmap_netvlad.commands import merge as command
 from colmap_netvlad.commands.merge import MergeOptions, merge_lines, merge_models, pairs_across
 from colmap_netvlad.demo.simulate import SimulationOptions, simulate_flight
@@ -21,7 +22,7 @@ from colmap_netvlad.mapping import parallel
 from colmap_netvlad.mapping.incremental import map_incremental
 from colmap_netvlad.mapping.merge import SubModel, read_sub_model
 from colmap_netvlad.mapping.options import MappingOptions
-from colmap_netvlad.mapping.together import matches_across, put_together
+from colmap_netvlad.mapping.together import database_cameras, matches_across, put_together
 from colmap_netvlad.project import Project
 from colmap_netvlad.runtime.errors import InputError
 
@@ -167,6 +168,28 @@ def test_models_without_a_match_across_stay(own: Flights, tmp_path: Path) -> Non
     report = merge_models(own.project, own.models[:2], tmp_path / "out", MergeOptions(across=8))
     assert [len(members) for members in report.members] == [1, 1]
     assert "no verified match joins it" in "\n".join(merge_lines(report))
+
+
+def test_models_of_two_projects_in_one_database(flights: Flights, tmp_path: Path) -> None:
+    """COLMAP's database_merger numbers images and cameras anew: each keeps its own lens."""
+    models, halves = [], [list(flights.truth)[:16], list(flights.truth)[16:32]]
+    for number, names in enumerate(halves):
+        copy_images(flights.database, tmp_path / f"{number}.db", names)
+        model = pycolmap.Reconstruction(flights.models[number])
+        model.cameras[1].params = [700.0 + number, *model.cameras[1].params[1:]]
+        models.append(model)
+    opened = [pycolmap.Database.open(tmp_path / f"{i}.db") for i in (0, 1)]
+    together = pycolmap.Database.open(tmp_path / "together.db")
+    pycolmap.Database.merge(*opened, together)
+    camera_of = {image.image_id: image.camera_id for image in together.read_all_images()}
+    assert len(set(camera_of.values())) == 2
+    for number, model in enumerate(models):
+        model.transcribe_image_ids_to_database(together)
+        ((camera_id, (params, count)),) = database_cameras(model, camera_of).items()
+        assert (params[0], count) == (700 + number, 16)
+        assert camera_id == camera_of[next(iter(model.reg_image_ids()))]
+    for database in (*opened, together):
+        database.close()
 
 
 def test_only_pairs_across_are_asked_for() -> None:

@@ -193,8 +193,9 @@ def _in_database(
     if strangers:
         raise InputError(
             f"{len(strangers)} photos of {name} (first: {strangers[0]}) are not in "
-            f"{project.database}: import all photos into one project with `colmap-netvlad "
-            "features` first."
+            f"{project.database}: bring the projects into one database first (COLMAP's "
+            "`database_merger`; image names stay and must differ), or import all photos into one "
+            "with `colmap-netvlad features`."
         )
     opened = pycolmap.Database.open(project.database)
     try:

@@ -53,6 +53,8 @@ class Georeference:
                 f"(UTM: EPSG {self.frame.epsg})"
             )
         lines = [f"Georegistered in {where}."]
+        if self.frame is not None:
+            lines.append(f"Heights are {HEIGHTS}.")
         if self.control is not None:
             lines += self.control.lines()
         if agreed:

@@ -8,7 +8,8 @@ errors do not add up along a chain.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -201,8 +202,13 @@ def join_and_adjust(
     A model that joins no other is written as it is. What happened is in `folder`/merge.json.
     """
     read = {name: pycolmap.Reconstruction(path) for name, path in models}
+    sub_models = [read_sub_model(name, model) for name, model in read.items()]
+    with open_database(database) as opened:
+        camera_of = {row.image_id: row.camera_id for row in opened.images()}
+    for sub, model in zip(sub_models, read.values(), strict=True):
+        sub.cameras = database_cameras(model, camera_of)
     joined = put_together(
-        [read_sub_model(name, model) for name, model in read.items()],
+        sub_models,
         matches_across(database, [set(model.reg_image_ids()) for model in read.values()]),
         options.seed,
     )
@@ -223,6 +229,26 @@ def join_and_adjust(
             result.write(target)
         told.append({"members": group.members, "refused": group.refused})
     (folder / "merge.json").write_text(json.dumps(told), encoding="utf-8")
+
+
+def database_cameras(
+    model: pycolmap.Reconstruction, camera_of: Mapping[int, int]
+) -> dict[int, tuple[Floats, int]]:
+    """Return a model's intrinsics by the database's camera ids, and how many images have them.
+
+    The ids in a model are those of the database it was made from, which may be another: databases
+    that were put together have new ones.
+
+    Args:
+        camera_of: the database's camera of each image id.
+    """
+    images = [model.image(image_id) for image_id in model.reg_image_ids()]
+    counts = Counter(camera_of[image.image_id] for image in images)
+    own = {camera_of[image.image_id]: image.camera_id for image in images}
+    return {
+        camera_id: (np.array(model.camera(own[camera_id]).params), count)
+        for camera_id, count in counts.items()
+    }
 
 
 def matches_across(database: Path, homes: Sequence[set[int]]) -> list[Matches]:
