@@ -7,6 +7,7 @@ import os
 import re
 import sqlite3
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ from colmap_netvlad.colmap.database import image_names, open_database
 from colmap_netvlad.commands.report import find_positions, model_of, report, save_run
 from colmap_netvlad.demo.simulate import FOCAL, SimulationOptions, simulate_flight
 from colmap_netvlad.mapping.incremental import map_incremental
+from colmap_netvlad.photos.shutters import RollingShutter
 from colmap_netvlad.report import missing as reasons
 from colmap_netvlad.report.cameras import camera_reports
 from colmap_netvlad.report.flight_page import render_flight_page
@@ -400,3 +402,12 @@ def test_a_report_that_cannot_be_made_loses_no_model(project_copy, monkeypatch, 
     assert run.exit_code == 0, run.output
     assert "No quality report of" in run.stderr and "no space left" in run.stderr
     assert (project.sparse / "0" / "images.bin").is_file()
+
+
+def test_rolling_shutters_are_named_with_their_cost(mapped):
+    made = report(mapped / "sparse/0")
+    assert made.quality.shutters == []  # the demo's camera is not known to have one
+    shutter = RollingShutter("DJI Mavic Air 2 (FC3170)", 0.027, 8.0)
+    page = render_flight_page(replace(made.quality, shutters=[shutter]), made.checks)
+    assert "DJI Mavic Air 2 (FC3170) has a rolling shutter" in page
+    assert re.search(r"at 8.0 m/s the drone flies 22 cm meanwhile, \d\.\d pixels", page)
