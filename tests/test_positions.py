@@ -90,6 +90,17 @@ def test_equal_gps_in_all_photos_says_nothing() -> None:
     assert "equal" in positions.notes[0]
 
 
+def test_repeated_gps_is_said_and_used() -> None:
+    found = line(5)
+    found[3] = found[2]
+    positions = place(found, NAMES)
+    assert positions.known.all()
+    (note,) = positions.notes
+    assert note.startswith("1 photo (first: DJI_0003.JPG) had exactly the position of one before")
+    bands = ["IMG_0000_1.tif", "IMG_0000_2.tif", "IMG_0001_1.tif"]  # one shot, one place
+    assert place([found[0], found[0], found[1]], bands).notes == ()
+
+
 def test_gps_in_one_photo_is_not_useful() -> None:
     positions = place([wgs84(47.0, 8.0), None, None], NAMES[:3])
     assert not positions.useful

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import UnidentifiedImageError
 
+from colmap_netvlad.photos.bands import named_band
 from colmap_netvlad.photos.files import open_header
 
 if TYPE_CHECKING:
@@ -77,7 +78,7 @@ def place(found: Sequence[PosePrior | None], names: Sequence[str]) -> Positions:
 
     Put aside are: latitude and longitude both zero, outside the globe, or more than `FAR_AWAY`
     from the median of the others. Swapped latitude and longitude are recognised where swapping
-    brings a photo back to the others, and mended.
+    brings a photo back to the others, and mended. Photos at exactly one place are named and stay.
     """
     system = _common_system(found)
     raw = np.array(
@@ -101,7 +102,21 @@ def place(found: Sequence[PosePrior | None], names: Sequence[str]) -> Positions:
         notes.append("All known positions are equal, so they say nothing; they are not used.")
         nowhere = np.full_like(metres, np.nan)
         return Positions(nowhere, tuple(notes), None if geographic is None else nowhere)
+    repeated = _repeated(metres, names)
+    if repeated.any():
+        what = "had exactly the position of one before, as where GPS stands still; used even so"
+        return Positions(metres, (*notes, _sentence(repeated, names, what)), geographic)
     return positions
+
+
+def _repeated(metres: NDArray[np.float64], names: Sequence[str]) -> NDArray[np.bool_]:
+    """Return which photos have the place of an earlier one that is not a band of the same shot."""
+    first: dict[tuple[float, ...], str] = {}
+    repeated = np.zeros(len(names), bool)
+    for i, (place, name) in enumerate(zip(metres[:, :2].tolist(), names, strict=True)):
+        shot = (named_band(name) or (name,))[0]
+        repeated[i] = first.setdefault(tuple(place), shot) != shot and np.isfinite(place).all()
+    return repeated
 
 
 def read_gps(photo: Path) -> PosePrior | None:
