@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import sparse
 
 from colmap_netvlad.cache.ranking import NO_PARTNER, Ranking
@@ -87,13 +88,18 @@ def expand(
     return ((expanded + expanded.T) / 2).tocsr()
 
 
-def keep_best(matrix: sparse.csr_array, depth: int) -> sparse.csr_array:
-    """Return the matrix with only the `depth` largest values of each row."""
+def keep_best(matrix: sparse.csr_array, depth: int | NDArray[np.intp]) -> sparse.csr_array:
+    """Return the matrix with only the `depth` largest values of each row; equals go by column.
+
+    Args:
+        depth: one number for all rows, or (N,) one for each.
+    """
     matrix = matrix.tocsr()
+    most = np.broadcast_to(depth, matrix.shape[0])
     rows = np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
     order = np.lexsort((matrix.indices, -matrix.data, rows))
     place = np.arange(len(rows)) - matrix.indptr[rows]
-    kept = order[place < depth]
+    kept = order[place < most[rows]]
     return sparse.csr_array(
         (matrix.data[kept], (rows[kept], matrix.indices[kept])), shape=matrix.shape
     )

@@ -6,8 +6,9 @@ descriptors are matched (mutual nearest neighbours), and the matches that agree 
 transform (turn, scale, shift) are counted. Photos from above are nearly such transforms of each
 other, photos of facades in part. A pair takes about a hundredth of matching its SIFT features.
 
-The counts then spread by query expansion: the sure neighbours of my sure neighbours are likely
-mine.
+The counts spread by query expansion: the sure neighbours of my sure neighbours are likely mine.
+So they choose what is compared next, and a photo stops asking once its latest comparisons found
+nothing: most of a long list of candidates teaches nothing.
 """
 
 from __future__ import annotations
@@ -46,6 +47,15 @@ EXPANSION_NEIGHBOURS = 12
 EXPANSION_SHARE = 0.4
 """Query expansion. What these constants were chosen by: docs/training-log.md, section 9."""
 
+FIRST = 10
+NEXT = 5
+"""Candidates of each image compared at first, and then as long as the latest ones found a sure
+partner."""
+
+SURE = 5
+"""Matches beyond chance that make a partner sure: one of twenty pairs of different ground has more.
+"""
+
 TAIL = 1e-3
 """Weight of the candidates' own order, which decides where nothing agrees."""
 
@@ -59,11 +69,12 @@ Pairs = NDArray[np.intp]
 
 
 def rerank(candidates: Ranking, store: Store, model: str, k: int, depth: int = COMPARED) -> Ranking:
-    """Return a ranking as deep as the candidates', `depth` of them compared place by place.
+    """Return a ranking as deep as the candidates', at most `depth` of them compared place by place.
 
-    The first half are an image's best candidates; what these teach chooses the others, so that a
-    neighbour whom the descriptors overlooked is found by way of its neighbours. Counts are kept
-    in the store: pairs compared before are not compared again.
+    Each image asks for its best candidates, and for more as long as the latest of them were sure
+    partners. What was learned so far chooses: a neighbour whom the descriptors overlooked is
+    found by way of its neighbours. Counts are kept in the store: pairs compared before are not
+    compared again.
 
     Args:
         candidates: by whatever found them, `max(k, depth)` deep where there are as many images.
@@ -74,13 +85,22 @@ def rerank(candidates: Ranking, store: Store, model: str, k: int, depth: int = C
     counted = _Counted(store, model, candidates)
     own = TAIL * _own_order(candidates)
     similarity, seconds = own, 0.0
-    for share in (depth - depth // 2, depth // 2):
-        seconds += counted.compare(_pairs_of(keep_best(counted.without(similarity), share)))
-        start = time.perf_counter()
-        agreement = counted.agreement()
-        expanded = expand(agreement, EXPANSION_NEIGHBOURS, EXPANSION_SHARE, max(k, depth))
-        similarity = (expanded + own).tocsr()
-        seconds += time.perf_counter() - start
+    left = np.full(len(candidates.names), depth, np.intp)
+    asks = np.minimum(left, min(FIRST, depth - depth // 2))
+    with step("Comparing photos place by place", len(asks)) as bar:
+        while asks.any():
+            chosen = keep_best(counted.without(similarity), asks)
+            seconds += counted.compare(_pairs_of(chosen))
+            start = time.perf_counter()
+            agreement = counted.agreement()
+            expanded = expand(agreement, EXPANSION_NEIGHBOURS, EXPANSION_SHARE, max(k, depth))
+            similarity = (expanded + own).tocsr()
+            left -= asks
+            found = (chosen > 0).multiply(agreement > SURE).sum(axis=1) > 0
+            asking = int(np.count_nonzero(asks))
+            asks = np.where(found, np.minimum(NEXT, left), 0)
+            bar.advance(asking - int(np.count_nonzero(asks)))
+            seconds += time.perf_counter() - start
     # Logarithms: twice the matches are not twice as likely to be a true pair.
     best = ranking_of(similarity.log1p(), candidates.names, candidates.method, candidates.depth)
     return replace(
@@ -166,6 +186,7 @@ class _Counted:
         ids = [0 if name in left_out else numbers.get(name, 0) for name in candidates.names]
         self._ids = np.array(ids, np.int64)
         self._store = store
+        self._read = _reader(store, self._ids)
         self._known = store.agreements()
         self._pairs = np.zeros((0, 2), np.intp)
         self._matches = np.zeros(0)
@@ -177,7 +198,7 @@ class _Counted:
         keys = _joined(np.sort(self._ids[pairs], axis=1))
         missing = ~np.isin(keys, _joined(self._known[0]))
         if missing.any():
-            _compare(pairs[missing], self._ids, self._store)
+            _compare(pairs[missing], self._ids, self._store, self._read)
             self._known = self._store.agreements()
         known, matches, seconds = self._known
         at = np.searchsorted(_joined(known), keys)
@@ -208,13 +229,14 @@ def _joined(keys: NDArray[np.int64]) -> NDArray[np.int64]:
     return (keys[:, 0] << 32) + keys[:, 1]
 
 
-def _compare(pairs: Pairs, ids: NDArray[np.int64], store: Store) -> None:
+def _compare(
+    pairs: Pairs, ids: NDArray[np.int64], store: Store, read: Callable[[int], Places]
+) -> None:
     """Count the agreeing matches of pairs, ordered by their first image, into the store."""
-    read = _reader(store, ids, pairs[0, 0])
     starts = np.flatnonzero(np.diff(pairs[:, 0], prepend=-1))
     rows: list[tuple[int, int, int, float]] = []
     with (
-        step("Comparing photos place by place", len(pairs)) as bar,
+        step("Pairs of candidates", len(pairs)) as bar,
         # A pair is too little work to share: a thread for each of several pairs is twice as fast.
         threadpool_limits(1, "blas"),
         ThreadPoolExecutor(usable_processors()) as pool,
@@ -234,9 +256,10 @@ def _compare(pairs: Pairs, ids: NDArray[np.int64], store: Store) -> None:
     store.add_agreements(rows)
 
 
-def _reader(store: Store, ids: NDArray[np.int64], example: int) -> Callable[[int], Places]:
+def _reader(store: Store, ids: NDArray[np.int64]) -> Callable[[int], Places]:
     """Return a function from an image's index to its features, the latest kept in memory."""
-    values = store.read_cells(int(ids[example])).codes.size
+    with_cells = ids[ids > 0]
+    values = store.read_cells(int(with_cells[0])).codes.size if len(with_cells) else 0
     most = max(CACHE_BYTES // (4 * max(values, 1)), 2)
 
     @lru_cache(maxsize=most)
