@@ -47,14 +47,15 @@ EXPANSION_NEIGHBOURS = 12
 EXPANSION_SHARE = 0.4
 """Query expansion. What these constants were chosen by: docs/training-log.md, section 9."""
 
-FIRST = 10
-NEXT = 5
-"""Candidates of each image compared at first, and then as long as the latest ones found a sure
-partner."""
+ASK = 10
+"""Candidates that an image asks for at a time."""
+
+PATIENCE = 20
+"""An image asks no more after so many candidates in a row that were no sure partners."""
 
 SURE = 5
-"""Matches beyond chance that make a partner sure: one of twenty pairs of different ground has more.
-"""
+"""More matches beyond chance than this make a sure partner. What these three were chosen by:
+docs/training-log.md, section 10."""
 
 TAIL = 1e-3
 """Weight of the candidates' own order, which decides where nothing agrees."""
@@ -71,10 +72,10 @@ Pairs = NDArray[np.intp]
 def rerank(candidates: Ranking, store: Store, model: str, k: int, depth: int = COMPARED) -> Ranking:
     """Return a ranking as deep as the candidates', at most `depth` of them compared place by place.
 
-    Each image asks for its best candidates, and for more as long as the latest of them were sure
-    partners. What was learned so far chooses: a neighbour whom the descriptors overlooked is
-    found by way of its neighbours. Counts are kept in the store: pairs compared before are not
-    compared again.
+    Each image asks for its best candidates, a few at a time, until `PATIENCE` of them in a row
+    were no sure partners. What was learned so far chooses: a neighbour whom the descriptors
+    overlooked is found by way of its neighbours. Counts are kept in the store: pairs compared
+    before are not compared again.
 
     Args:
         candidates: by whatever found them, `max(k, depth)` deep where there are as many images.
@@ -85,8 +86,8 @@ def rerank(candidates: Ranking, store: Store, model: str, k: int, depth: int = C
     counted = _Counted(store, model, candidates)
     own = TAIL * _own_order(candidates)
     similarity, seconds = own, 0.0
-    left = np.full(len(candidates.names), depth, np.intp)
-    asks = np.minimum(left, min(FIRST, depth - depth // 2))
+    most = np.full(len(candidates.names), min(ASK, depth - depth // 2), np.intp)
+    asks, left, quiet = most, np.full_like(most, depth), np.zeros_like(most)
     with step("Comparing photos place by place", len(asks)) as bar:
         while asks.any():
             chosen = keep_best(counted.without(similarity), asks)
@@ -95,11 +96,11 @@ def rerank(candidates: Ranking, store: Store, model: str, k: int, depth: int = C
             agreement = counted.agreement()
             expanded = expand(agreement, EXPANSION_NEIGHBOURS, EXPANSION_SHARE, max(k, depth))
             similarity = (expanded + own).tocsr()
-            left -= asks
             found = (chosen > 0).multiply(agreement > SURE).sum(axis=1) > 0
-            asking = int(np.count_nonzero(asks))
-            asks = np.where(found, np.minimum(NEXT, left), 0)
-            bar.advance(asking - int(np.count_nonzero(asks)))
+            left, quiet = left - asks, np.where(found, 0, quiet + asks)
+            goes_on = (asks > 0) & (left > 0) & (quiet < PATIENCE)
+            bar.advance(int(np.count_nonzero((asks > 0) & ~goes_on)))
+            asks = np.where(goes_on, np.minimum(most, left), 0)
             seconds += time.perf_counter() - start
     # Logarithms: twice the matches are not twice as likely to be a true pair.
     best = ranking_of(similarity.log1p(), candidates.names, candidates.method, candidates.depth)
