@@ -213,7 +213,7 @@ RETRIEVAL: tuple[Callable[[Any], Any], ...] = (
         type=click.IntRange(min=0),
         default=COMPARED,
         show_default=True,
-        help="Candidates of each image that deep methods compare place by place; 0: none, the"
+        help="Most candidates of each image that deep methods compare place by place; 0: none, the"
         " global descriptors alone as in the paper.",
     ),
     masks_option,

@@ -18,7 +18,15 @@ from colmap_netvlad.cache.store import Store
 from colmap_netvlad.cli import cli
 from colmap_netvlad.retrieval import rerank as module
 from colmap_netvlad.retrieval.options import COMPARED, RetrievalOptions
-from colmap_netvlad.retrieval.rerank import CHANCE, Places, agreeing_matches, rerank
+from colmap_netvlad.retrieval.rerank import (
+    ASK,
+    CHANCE,
+    PATIENCE,
+    SURE,
+    Places,
+    agreeing_matches,
+    rerank,
+)
 
 SIDE, STEP, PHOTOS = 12, 4, 9
 """A strip of ground seen by photos of SIDE x SIDE cells, each STEP cells after the one before."""
@@ -147,6 +155,75 @@ def test_a_neighbour_whom_the_descriptors_overlooked_is_found_by_way_of_its_neig
     partners[0] = [1, 8, 7, 6, 5, 4, 3, 2]
     found = Ranking(candidates.names, partners, candidates.scores, "chance")
     assert set(rerank(found, store, "m", 2, depth=2).partners[0, :2]) == {1, 2}
+
+
+CIRCLE = 60
+"""Images each of which has the ones after it as candidates, the nearest first."""
+
+
+@pytest.fixture
+def compared_in_a_circle(tmp_path: Path, monkeypatch):
+    """Return a function: matches that agree of pairs -> (the pairs compared, the ranking)."""
+
+    def run(agreeing: dict[tuple[int, int], int], otherwise: int = 0, depth: int = CIRCLE - 1):
+        pairs = set()
+
+        def count(one: Places, other: Places) -> int:
+            pair = tuple(sorted(int(places.vectors[0].argmax()) for places in (one, other)))
+            pairs.add(pair)
+            return agreeing.get(pair, otherwise)
+
+        monkeypatch.setattr(module, "agreeing_matches", count)
+        names = tuple(f"{n:02d}.jpg" for n in range(CIRCLE))
+        cells = [Cells.of(np.eye(CIRCLE)[n].reshape(CIRCLE, 1, 1)) for n in range(CIRCLE)]
+        after = np.arange(1, CIRCLE)
+        partners = ((np.arange(CIRCLE)[:, None] + after) % CIRCLE).astype(np.int32)
+        scores = np.tile(1 / after.astype(np.float32), (CIRCLE, 1))
+        with Store(tmp_path / "circle.db") as store:
+            store.add_descriptors("m", names, names, np.zeros((CIRCLE, 4)), 0, cells)
+            ranking = rerank(Ranking(names, partners, scores, "circle"), store, "m", 5, depth)
+        return pairs, ranking
+
+    return run
+
+
+def circle_pairs(image: int, places: range) -> set[tuple[int, int]]:
+    """The pairs of an image with its candidates at these places, counted from 1."""
+    others = [(image + place) % CIRCLE for place in places]
+    return {(min(image, other), max(image, other)) for other in others}
+
+
+def asked_by_all(most: int) -> set[tuple[int, int]]:
+    return set().union(*(circle_pairs(i, range(1, most + 1)) for i in range(CIRCLE)))
+
+
+def test_who_finds_nothing_stops_asking(compared_in_a_circle) -> None:
+    pairs, ranking = compared_in_a_circle({})
+    assert pairs == asked_by_all(PATIENCE)
+    assert ranking.partners.shape == (CIRCLE, CIRCLE - 1), "the others follow in their own order"
+
+
+def test_a_little_beyond_chance_is_no_sure_partner(compared_in_a_circle) -> None:
+    pairs, _ = compared_in_a_circle({}, otherwise=CHANCE + SURE)
+    assert len(pairs) <= CIRCLE * PATIENCE < CIRCLE * (CIRCLE - 1) // 2
+
+
+def test_who_finds_a_sure_partner_late_goes_on_from_there(compared_in_a_circle) -> None:
+    partner = ASK + 5  # among the second of what image 0 asks for
+    pairs, ranking = compared_in_a_circle({(0, partner): CHANCE + SURE + 1})
+    assert pairs == asked_by_all(PATIENCE) | circle_pairs(0, range(1, 2 * ASK + PATIENCE + 1))
+    assert ranking.partners[0, 0] == partner
+    assert ranking.partners[partner, 0] == 0
+
+
+def test_where_all_are_partners_all_candidates_are_compared(compared_in_a_circle) -> None:
+    pairs, _ = compared_in_a_circle({}, otherwise=CHANCE + SURE + 1)
+    assert len(pairs) == CIRCLE * (CIRCLE - 1) // 2
+
+
+def test_no_image_asks_for_more_than_the_depth(compared_in_a_circle) -> None:
+    pairs, _ = compared_in_a_circle({}, otherwise=CHANCE + SURE + 1, depth=ASK + 3)
+    assert CIRCLE * (ASK + 3) // 2 <= len(pairs) <= CIRCLE * (ASK + 3)
 
 
 def test_what_was_compared_is_not_compared_again(store: Store, monkeypatch) -> None:

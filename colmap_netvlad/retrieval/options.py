@@ -8,7 +8,7 @@ from pathlib import Path
 from colmap_netvlad.runtime.errors import InputError
 
 COMPARED = 100
-"""Candidates of each image that are compared place by place where nothing else is said."""
+"""Most candidates of each image that are compared place by place where nothing else is said."""
 
 
 DEPTH = 200
@@ -57,7 +57,7 @@ class RetrievalOptions:
         masks: folder of masks in COLMAP's way: masked areas are neutral to deep descriptors.
         gps: whether positions re-weight the candidates, one of `GPS_MODES`; None: "auto" for
             methods that are not from the literature, else "off".
-        rerank: candidates of each image that deep methods compare place by place
+        rerank: most candidates of each image that deep methods compare place by place
             (`retrieval.rerank`); 0: none, the global descriptors alone.
     """
 

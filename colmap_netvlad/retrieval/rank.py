@@ -69,7 +69,7 @@ def _rank(flight: Flight, method: Method, options: RetrievalOptions, least_depth
         model = deep.cells_key(options.model or method.model, options)
         compared = min(options.rerank, others)
         ranking = rerank(ranking, flight.store, model, k, compared)
-        note = f"{compared} candidates of each image compared place by place"
+        note = f"up to {compared} candidates of each image compared place by place"
         ranking = replace(ranking, notes=(*ranking.notes, note))
     if k < options.k:
         note = f"k lowered from {options.k} to {k}: the project has {others + 1} images"
