@@ -157,7 +157,7 @@ def test_a_neighbour_whom_the_descriptors_overlooked_is_found_by_way_of_its_neig
     assert set(rerank(found, store, "m", 2, depth=2).partners[0, :2]) == {1, 2}
 
 
-CIRCLE = 60
+CIRCLE = 90
 """Images each of which has the ones after it as candidates, the nearest first."""
 
 
@@ -197,32 +197,43 @@ def asked_by_all(most: int) -> set[tuple[int, int]]:
     return set().union(*(circle_pairs(i, range(1, most + 1)) for i in range(CIRCLE)))
 
 
-def test_who_finds_nothing_stops_asking(compared_in_a_circle) -> None:
-    pairs, ranking = compared_in_a_circle({})
-    assert pairs == asked_by_all(PATIENCE)
+SURELY = CHANCE + SURE + 1
+NEXT_TO_EACH_OTHER = {
+    (min(pair), max(pair)): SURELY for pair in ((i, (i + 1) % CIRCLE) for i in range(CIRCLE))
+}
+"""Each image has two sure partners: the one after it, its first candidate, and the one before."""
+
+
+def test_who_finds_nothing_more_stops_asking(compared_in_a_circle) -> None:
+    pairs, ranking = compared_in_a_circle(NEXT_TO_EACH_OTHER)
+    assert pairs == asked_by_all(ASK + PATIENCE)
+    assert set(ranking.partners[7, :2]) == {6, 8}
     assert ranking.partners.shape == (CIRCLE, CIRCLE - 1), "the others follow in their own order"
 
 
-def test_a_little_beyond_chance_is_no_sure_partner(compared_in_a_circle) -> None:
-    pairs, _ = compared_in_a_circle({}, otherwise=CHANCE + SURE)
-    assert len(pairs) <= CIRCLE * PATIENCE < CIRCLE * (CIRCLE - 1) // 2
-
-
 def test_who_finds_a_sure_partner_late_goes_on_from_there(compared_in_a_circle) -> None:
-    partner = ASK + 5  # among the second of what image 0 asks for
-    pairs, ranking = compared_in_a_circle({(0, partner): CHANCE + SURE + 1})
-    assert pairs == asked_by_all(PATIENCE) | circle_pairs(0, range(1, 2 * ASK + PATIENCE + 1))
+    partner = PATIENCE + 5  # among the last that image 0 would have asked for
+    pairs, ranking = compared_in_a_circle(NEXT_TO_EACH_OTHER | {(0, partner): 2 * SURELY})
+    assert pairs == asked_by_all(ASK + PATIENCE) | circle_pairs(0, range(1, ASK + 2 * PATIENCE + 1))
     assert ranking.partners[0, 0] == partner
     assert ranking.partners[partner, 0] == 0
 
 
+@pytest.mark.parametrize("matches", [0, SURELY - 1])
+def test_who_has_hardly_a_sure_partner_asks_to_the_end(compared_in_a_circle, matches: int) -> None:
+    alone = {pair: count for pair, count in NEXT_TO_EACH_OTHER.items() if 0 not in pair}
+    pairs, _ = compared_in_a_circle(alone | {(0, CIRCLE - 1): matches})
+    assert pairs >= circle_pairs(0, range(1, CIRCLE))
+    assert len(pairs) < CIRCLE * (CIRCLE - 1) // 2, "the others stopped"
+
+
 def test_where_all_are_partners_all_candidates_are_compared(compared_in_a_circle) -> None:
-    pairs, _ = compared_in_a_circle({}, otherwise=CHANCE + SURE + 1)
+    pairs, _ = compared_in_a_circle({}, otherwise=SURELY)
     assert len(pairs) == CIRCLE * (CIRCLE - 1) // 2
 
 
 def test_no_image_asks_for_more_than_the_depth(compared_in_a_circle) -> None:
-    pairs, _ = compared_in_a_circle({}, otherwise=CHANCE + SURE + 1, depth=ASK + 3)
+    pairs, _ = compared_in_a_circle({}, otherwise=SURELY, depth=ASK + 3)
     assert CIRCLE * (ASK + 3) // 2 <= len(pairs) <= CIRCLE * (ASK + 3)
 
 

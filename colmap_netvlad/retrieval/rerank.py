@@ -53,9 +53,12 @@ ASK = 10
 PATIENCE = 20
 """An image asks no more after so many candidates in a row that were no sure partners."""
 
-SURE = 5
-"""More matches beyond chance than this make a sure partner. What these three were chosen by:
-docs/training-log.md, section 10."""
+SURE = 10
+"""More matches beyond chance than this make a sure partner."""
+
+SURE_PARTNERS = 2
+"""Who has fewer sure partners asks on: what hardly overlaps with any other is not to be missed.
+What these four were chosen by: docs/training-log.md, section 10."""
 
 TAIL = 1e-3
 """Weight of the candidates' own order, which decides where nothing agrees."""
@@ -72,10 +75,10 @@ Pairs = NDArray[np.intp]
 def rerank(candidates: Ranking, store: Store, model: str, k: int, depth: int = COMPARED) -> Ranking:
     """Return a ranking as deep as the candidates', at most `depth` of them compared place by place.
 
-    Each image asks for its best candidates, a few at a time, until `PATIENCE` of them in a row
-    were no sure partners. What was learned so far chooses: a neighbour whom the descriptors
-    overlooked is found by way of its neighbours. Counts are kept in the store: pairs compared
-    before are not compared again.
+    Each image asks for its best candidates, `ASK` at a time, until `PATIENCE` in a row were no
+    sure partners, or to the end where it has hardly any. What was learned so far chooses: a
+    neighbour whom the descriptors overlooked is found by way of its neighbours. Counts are kept
+    in the store: pairs compared before are not compared again.
 
     Args:
         candidates: by whatever found them, `max(k, depth)` deep where there are as many images.
@@ -96,11 +99,13 @@ def rerank(candidates: Ranking, store: Store, model: str, k: int, depth: int = C
             agreement = counted.agreement()
             expanded = expand(agreement, EXPANSION_NEIGHBOURS, EXPANSION_SHARE, max(k, depth))
             similarity = (expanded + own).tocsr()
-            found = (chosen > 0).multiply(agreement > SURE).sum(axis=1) > 0
-            left, quiet = left - asks, np.where(found, 0, quiet + asks)
-            goes_on = (asks > 0) & (left > 0) & (quiet < PATIENCE)
-            bar.advance(int(np.count_nonzero((asks > 0) & ~goes_on)))
-            asks = np.where(goes_on, np.minimum(most, left), 0)
+            sure = agreement > SURE
+            found = (chosen > 0).multiply(sure).sum(axis=1) > 0
+            quiet = np.where(found, 0, quiet + asks)
+            goes_on = (quiet < PATIENCE) | (sure.sum(axis=1) < SURE_PARTNERS)
+            left = left - asks
+            asked, asks = asks, np.where((asks > 0) & goes_on, np.minimum(most, left), 0)
+            bar.advance(int(np.count_nonzero(asked) - np.count_nonzero(asks)))
             seconds += time.perf_counter() - start
     # Logarithms: twice the matches are not twice as likely to be a true pair.
     best = ranking_of(similarity.log1p(), candidates.names, candidates.method, candidates.depth)
