@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from colmap_netvlad.graph.viewgraph import read_view_graph
     from colmap_netvlad.project import open_project
     from colmap_netvlad.retrieval.options import RetrievalOptions
+    from colmap_netvlad.runtime.cluster import on_cluster
     from colmap_netvlad.runtime.errors import InputError
     from colmap_netvlad.runtime.progress import report_to
 
@@ -38,6 +39,7 @@ __all__ = [
     "import_photos",
     "make_pairs",
     "match",
+    "on_cluster",
     "open_project",
     "read_view_graph",
     "reconstruct",
@@ -52,6 +54,7 @@ _HOMES = {
     "import_photos": "commands.features",
     "make_pairs": "commands.pairs",
     "match": "commands.match",
+    "on_cluster": "runtime.cluster",
     "open_project": "project",
     "read_view_graph": "graph.viewgraph",
     "reconstruct": "commands.reconstruct",

@@ -20,6 +20,7 @@ from colmap_netvlad.cli_options import (
     FILE,
     FOLDER,
     PATH,
+    cluster_option,
     database_option,
     device_option,
     feature_options,
@@ -112,6 +113,7 @@ def cli() -> None:
 @feature_options
 @masks_option
 @verbose_option
+@cluster_option
 def features(images: Path, database: Path, features: FeatureOptions, masks: Path | None) -> None:
     """Import photos into a COLMAP database and extract SIFT features.
 
@@ -184,6 +186,7 @@ def features(images: Path, database: Path, features: FeatureOptions, masks: Path
 )
 @json_option
 @verbose_option
+@cluster_option
 def pairs(
     project: Project,
     k: int,
@@ -234,6 +237,7 @@ def pairs(
 @matching_options
 @json_option
 @verbose_option
+@cluster_option
 def match(
     project: Project,
     pairs: Path | None,
@@ -275,6 +279,7 @@ def match(
 @matching_options
 @json_option
 @verbose_option
+@cluster_option
 def reconstruct(
     project: Project,
     pairs: Path | None,
@@ -616,6 +621,7 @@ def demo(output: Path, method: str | None, seed: int) -> None:
     "--yes", "confirm", is_flag=True, help="Do not ask before a long exhaustive matching."
 )
 @verbose_option
+@cluster_option
 def compare(
     project: Project,
     methods: str,

@@ -447,3 +447,20 @@ def mapping_options(
     limit = None if memory is None else memory * 2**30
     mapping = MappingOptions(threads=threads, cluster_size=cluster_size, memory=limit)
     return {"mapper": mapper, "mapping": mapping}
+
+
+@bundle(
+    click.option(
+        "--cluster",
+        metavar="auto|HOST:PORT",
+        help="Let the machines of a Ray cluster do the work: auto, the one that this machine is in,"
+        " or its head. All of them see the photos under the same path.",
+    )
+)
+def cluster_option(cluster: str | None) -> dict[str, Any]:
+    """--cluster: connected while the command runs. Innermost, after all else is checked."""
+    if cluster is not None:
+        from colmap_netvlad.runtime.cluster import on_cluster
+
+        click.get_current_context().with_resource(on_cluster(cluster))
+    return {}

@@ -10,6 +10,7 @@ import sqlite3
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from pathlib import Path
+from typing import Any
 
 from colmap_netvlad.colmap.database import Database, open_database, pair_id
 from colmap_netvlad.runtime.files import atomic_path
@@ -25,6 +26,9 @@ CAMERAS = ("cameras", "rigs", "rig_sensors")
 
 LOCK_SECONDS = 60.0
 """How long a process waits for the others' writing, a fraction of a second each."""
+
+Rows = dict[str, tuple[list[str], list[tuple[Any, ...]]]]
+"""Table -> its columns, and rows of values."""
 
 AT_ONCE = 500
 """Keys in one query: sqlite takes 999 in its oldest versions."""
@@ -149,6 +153,36 @@ def copy_matches(source: Path, target: Path, pairs: Collection[int]) -> None:
         new.commit()
 
 
+def read_rows(source: Path, tables: Mapping[str, tuple[str, Iterable[int]] | None]) -> Rows:
+    """Return rows for `write_rows`.
+
+    Args:
+        tables: table -> a column and its values; None for all rows. Absent tables are passed over.
+
+    Raises:
+        InputError: the source cannot be read.
+    """
+    with open_database(source) as old:
+        return {table: _read_rows(old.connection, table, keys) for table, keys in tables.items()}
+
+
+def write_rows(target: Path, rows: Rows) -> None:
+    """Write rows whole or not at all; what `target` has under their keys is replaced."""
+    with closing(sqlite3.connect(target, timeout=LOCK_SECONDS, isolation_level=None)) as new:
+        new.execute("BEGIN IMMEDIATE")
+        for table, (columns, values) in rows.items():
+            there = _columns(new, table)
+            kept = [i for i, column in enumerate(columns) if column in there]
+            names = ", ".join(f'"{columns[i]}"' for i in kept)
+            places = ", ".join("?" * len(kept))
+            if kept:
+                new.executemany(
+                    f'INSERT OR REPLACE INTO "{table}" ({names}) VALUES ({places})',
+                    [[row[i] for i in kept] for row in values],
+                )
+        new.commit()
+
+
 @contextmanager
 def _new_database(target: Path) -> Iterator[sqlite3.Connection]:
     with atomic_path(target) as temporary, closing(sqlite3.connect(temporary)) as new:
@@ -214,6 +248,21 @@ def _copy_rows(
         some = keys[at : at + AT_ONCE]
         wanted = f" WHERE {key} IN ({', '.join('?' * len(some))}) ORDER BY {key}"
         new.executemany(insert, old.execute(select + wanted, some))
+
+
+def _read_rows(
+    connection: sqlite3.Connection, table: str, keys: tuple[str, Iterable[int]] | None
+) -> tuple[list[str], list[tuple[Any, ...]]]:
+    columns, rows = _columns(connection, table), []
+    if columns and keys is None:
+        rows = connection.execute(f'SELECT * FROM "{table}"').fetchall()
+    elif columns and keys is not None:
+        values = sorted(keys[1])
+        for at in range(0, len(values), AT_ONCE):
+            some = values[at : at + AT_ONCE]
+            wanted = f"{keys[0]} IN ({', '.join('?' * len(some))}) ORDER BY {keys[0]}"
+            rows += connection.execute(f'SELECT * FROM "{table}" WHERE {wanted}', some).fetchall()
+    return columns, rows
 
 
 def _columns(connection: sqlite3.Connection, table: str) -> list[str]:

@@ -9,15 +9,19 @@ next one.
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from contextlib import closing
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path, PurePosixPath
 
 import pycolmap
 
 from colmap_netvlad.colmap import engine
+from colmap_netvlad.colmap.copies import write_rows
 from colmap_netvlad.colmap.database import ImageRow, open_database
+from colmap_netvlad.colmap.parts import PartsOfImport
 from colmap_netvlad.photos.bands import lens_band
 from colmap_netvlad.photos.files import (
     PHOTO_SUFFIXES,
@@ -27,8 +31,9 @@ from colmap_netvlad.photos.files import (
     read_header,
 )
 from colmap_netvlad.photos.masks import find_mask
-from colmap_netvlad.runtime import progress
+from colmap_netvlad.runtime import progress, workers
 from colmap_netvlad.runtime.errors import InputError
+from colmap_netvlad.runtime.jobs import Load, Source
 from colmap_netvlad.runtime.machine import usable_memory, usable_processors
 
 CHUNK_PHOTOS = 8
@@ -134,7 +139,7 @@ def extract_features(
     return _report(database, names, todo, bad)
 
 
-@dataclass
+@dataclass(frozen=True)
 class _Group:
     """New photos of one camera; `camera_id` is None until the database has that camera."""
 
@@ -260,6 +265,27 @@ def _known_cameras(images: Path, rows: Sequence[ImageRow], mode: str) -> dict[Ca
 def _extract_group(
     images: Path, database: Path, group: _Group, options: FeatureOptions, bar: progress.Step
 ) -> None:
+    engine.make_or_migrate(database)
+    if group.mode == pycolmap.CameraMode.SINGLE and group.camera_id is None:
+        group = replace(group, camera_id=_new_camera(images, database, group, options))
+    parts = PartsOfImport(database, group.names)
+    seen = (images,) if options.masks is None else (images, options.masks)
+    extracted = workers.stream(
+        partial(_extract, images, group, options),
+        group.names,
+        engine.initialiser(),
+        Source(database, parts.part, parts.rows, write_rows),
+        Load(options.threads or 1, _scale_space(options), seen=seen),
+    )
+    with closing(extracted) as counts:
+        for count in counts:
+            bar.advance(count)
+
+
+def _extract(
+    images: Path, group: _Group, options: FeatureOptions, database: Path, names: Sequence[str]
+) -> Iterator[int]:
+    """Import photos of a group and extract their features, in chunks; yield how many each had."""
     reader = pycolmap.ImageReaderOptions()
     if options.masks is not None:
         reader.mask_path = options.masks
@@ -269,8 +295,8 @@ def _extract_group(
     if options.max_image_size is not None:
         extraction.max_image_size = options.max_image_size
     size = CHUNK_PHOTOS * extraction.num_threads
-    for start in range(0, len(group.names), size):
-        chunk = group.names[start : start + size]
+    for start in range(0, len(names), size):
+        chunk = names[start : start + size]
         _import(images, database, group, options, chunk)
         engine.call(
             pycolmap.extract_features,
@@ -282,7 +308,7 @@ def _extract_group(
             reader_options=reader,
             extraction_options=extraction,
         )
-        bar.advance(len(chunk))
+        yield len(chunk)
 
 
 def _import(
@@ -299,26 +325,32 @@ def _import(
     reader.camera_model = options.camera_model
     if group.camera_id is not None:
         reader.existing_camera_id = group.camera_id
-    engine.make_or_migrate(database)
     with engine.faults_said():
         pycolmap.import_images(database, images, group.mode, list(names), reader)
-    if group.mode == pycolmap.CameraMode.SINGLE and group.camera_id is None:
-        group.camera_id = _camera_of(database, names)
 
 
-def _camera_of(database: Path, names: Iterable[str]) -> int | None:
-    with open_database(database) as colmap:
-        cameras = {row.name: row.camera_id for row in colmap.images()}
-    return next((cameras[name] for name in names if name in cameras), None)
+def _new_camera(images: Path, database: Path, group: _Group, options: FeatureOptions) -> int | None:
+    """Import the first photo of a new camera, and return the camera's id."""
+    for name in group.names:
+        _import(images, database, group, options, [name])
+        with open_database(database) as colmap:
+            camera = next((row.camera_id for row in colmap.images() if row.name == name), None)
+        if camera is not None:
+            return camera
+    return None
 
 
 def _threads(options: FeatureOptions) -> int:
     """As many threads as processors, unless SIFT's scale space would fill half the memory."""
     if options.threads is not None:
         return options.threads
+    return max(1, min(usable_processors(), int(usable_memory() / 2 / _scale_space(options))))
+
+
+def _scale_space(options: FeatureOptions) -> float:
+    """Bytes that SIFT takes for a photo."""
     side = options.max_image_size or SIFT_LONG_SIDE
-    scale_space = SIFT_LEVELS * 4 * (2 * side) * (2 * side) * 3 / 4
-    return max(1, min(usable_processors(), int(usable_memory() / 2 / scale_space)))
+    return SIFT_LEVELS * 4 * (2 * side) * (2 * side) * 3 / 4
 
 
 def _report(

@@ -12,8 +12,7 @@ from colmap_netvlad.comparison.workspace import Workspace
 from colmap_netvlad.graph.pair import Pair, as_pair
 from colmap_netvlad.matching.options import MatchOptions
 from colmap_netvlad.matching.run import match_pairs
-from colmap_netvlad.runtime import progress
-from colmap_netvlad.runtime.machine import usable_processors
+from colmap_netvlad.runtime import progress, workers
 from colmap_netvlad.runtime.sequences import blocks
 
 CHUNK = 256
@@ -98,5 +97,5 @@ def _match_timed(workspace: Workspace, pairs: Sequence[Pair], options: MatchOpti
 
 
 def _chunks(pairs: Sequence[Pair], options: MatchOptions) -> Iterator[Sequence[Pair]]:
-    size = CHUNK * (options.processes or usable_processors())
+    size = CHUNK * (options.processes or workers.capacity().processors)
     return (pairs[part] for part in blocks(len(pairs), size))

@@ -16,6 +16,7 @@ import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import pycolmap
 
@@ -32,7 +33,7 @@ from colmap_netvlad.mapping.refine import load_cache, rebuild, refine
 from colmap_netvlad.runtime import progress, workers
 from colmap_netvlad.runtime.errors import InputError
 from colmap_netvlad.runtime.files import write_atomically
-from colmap_netvlad.runtime.machine import usable_memory, usable_processors
+from colmap_netvlad.runtime.jobs import Load, Source
 
 logger = logging.getLogger(__name__)
 
@@ -212,10 +213,15 @@ def map_clusters(
     parts = {number: Path(tempfile.mkdtemp(suffix=".part", dir=state)) for number in todo}
     largest = max((len(clusters[number].images) for number in todo), default=0)
     count = worker_count(database, largest, len(todo), options)
-    threads = max(1, (options.threads or usable_processors()) // max(count, 1))
+    there = workers.capacity()
+    threads = max(1, min(there.largest, (options.threads or there.processors) // max(count, 1)))
     jobs = [
         workers.Job(
-            map_cluster, (database, parts[number], clusters[number].images, options, threads)
+            map_cluster,
+            (clusters[number].images, options, threads),
+            Source(database, part_of_cluster),
+            parts[number],
+            Load(threads, worker_bytes(database, largest)),
         )
         for number in todo
     ]
@@ -239,6 +245,11 @@ def map_clusters(
     if faults and len(faults) == len(clusters):
         raise InputError(f"None of the {len(clusters)} clusters could be mapped: {faults[0]}.")
     return report
+
+
+def part_of_cluster(database: Path, arguments: Sequence[Any], target: Path) -> None:
+    """Write what `map_cluster` reads of a database."""
+    copy_images(database, target, arguments[0])
 
 
 def map_cluster(
@@ -372,14 +383,19 @@ def worker_count(database: Path, largest: int, jobs: int, options: MappingOption
     """Return how many clusters are mapped at once within the processors and the memory.
 
     Args:
-        largest: images of the largest cluster; its memory is estimated from its share of the
-            database.
+        largest: images of the largest cluster.
     """
-    processors = options.threads or usable_processors()
-    memory = options.memory or MEMORY_SHARE * usable_memory()
-    share = largest / max(1, _image_count(database))
-    one = WORKER_BYTES + BYTES_PER_DATABASE_BYTE * share * database.stat().st_size
-    return max(1, min(processors, jobs, math.floor(memory / one)))
+    there = workers.capacity()
+    processors = options.threads or there.processors
+    memory = options.memory or MEMORY_SHARE * there.memory
+    return max(1, min(processors, jobs, math.floor(memory / worker_bytes(database, largest))))
+
+
+def worker_bytes(database: Path, images: int) -> float:
+    """Return the memory that mapping a cluster of so many images takes, estimated from their
+    share of the database."""
+    share = images / max(1, _image_count(database))
+    return WORKER_BYTES + BYTES_PER_DATABASE_BYTE * share * database.stat().st_size
 
 
 def _image_count(database: Path) -> int:

@@ -23,6 +23,7 @@ from threadpoolctl import threadpool_limits
 from colmap_netvlad.colmap import engine
 from colmap_netvlad.colmap.copies import LOCK_SECONDS
 from colmap_netvlad.colmap.database import Database, open_database
+from colmap_netvlad.colmap.parts import part_of_pairs
 from colmap_netvlad.colmap.results import PairResult, camera_of, write_results
 from colmap_netvlad.graph.pair import IdPair
 from colmap_netvlad.matching.features import SiftFeatures, prepare
@@ -30,7 +31,7 @@ from colmap_netvlad.matching.guided import Stage, match
 from colmap_netvlad.matching.options import MatchOptions, Work
 from colmap_netvlad.matching.verify import verify
 from colmap_netvlad.runtime import workers
-from colmap_netvlad.runtime.machine import usable_processors
+from colmap_netvlad.runtime.jobs import Source
 from colmap_netvlad.runtime.sequences import blocks
 
 logger = logging.getLogger(__name__)
@@ -133,16 +134,16 @@ def _reports(
     database: Path, pairs: Sequence[IdPair], options: MatchOptions
 ) -> Generator[BlockReport, None, None]:
     count = max(1, min(_most(options), len(pairs) // WORTH_A_PROCESS))
-    tasks = [pairs[part] for part in blocks(len(pairs), BLOCK)]
     if count == 1:
-        photos = Photos()
+        photos, tasks = Photos(), (pairs[part] for part in blocks(len(pairs), BLOCK))
         return (match_block(photos, database, options, task) for task in tasks)
     begin = partial(_begin, engine.initialiser())
-    return workers.results(partial(_match_block, database, options), tasks, count, begin)
+    source = Source(database, part_of_pairs)
+    return workers.results(partial(_match_block, options), pairs, count, begin, source, first=BLOCK)
 
 
 def _most(options: MatchOptions) -> int:
-    return options.processes or usable_processors()
+    return options.processes or workers.capacity().processors
 
 
 _photos: Photos
@@ -155,7 +156,7 @@ def _begin(initialise: Callable[[], None]) -> None:
     _photos = Photos()
 
 
-def _match_block(database: Path, options: MatchOptions, pairs: Sequence[IdPair]) -> BlockReport:
+def _match_block(options: MatchOptions, database: Path, pairs: Sequence[IdPair]) -> BlockReport:
     return match_block(_photos, database, options, pairs)
 
 

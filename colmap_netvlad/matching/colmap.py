@@ -11,31 +11,30 @@ features of its chunk, and there are as many processes as processors.
 
 from __future__ import annotations
 
+import sqlite3
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
+from contextlib import closing
+from functools import partial
 from pathlib import Path
 
 import pycolmap
 
 from colmap_netvlad.colmap import engine
-from colmap_netvlad.colmap.copies import copy_features, copy_matches
+from colmap_netvlad.colmap.copies import copy_features, copy_matches, write_rows
 from colmap_netvlad.colmap.database import pair_id
+from colmap_netvlad.colmap.parts import part_of_pairs, rows_of_pairs
 from colmap_netvlad.graph.pair import IdPair
 from colmap_netvlad.matching.options import MatchOptions, Work
 from colmap_netvlad.runtime import workers
 from colmap_netvlad.runtime.errors import InputError
 from colmap_netvlad.runtime.files import scratch_folder
-from colmap_netvlad.runtime.machine import usable_processors
+from colmap_netvlad.runtime.jobs import Shares, Source
 
 FIRST_CHUNK = 32
 """Pairs of the first chunk; the next ones are sized to take `CHUNK_SECONDS`."""
 
 CHUNK_SECONDS = 30.0
-MAX_CHUNK = 4096
-
-BLOCK = 128
-"""Processes take turns by blocks of this many pairs, so that all get their share of slow ones."""
-
 WORTH_A_PROCESS = 128
 """Fewer pairs than this take less time than a process takes to start."""
 
@@ -44,47 +43,53 @@ def match_by_colmap(
     database: Path, pairs: Sequence[IdPair], options: MatchOptions, advance: Callable[[int], None]
 ) -> Work:
     """Match and verify pairs with COLMAP's matcher, as `matchers.Match`."""
-    most = 1 if pycolmap.has_cuda else options.processes or usable_processors()
+    most = 1 if pycolmap.has_cuda else options.processes or workers.capacity().processors
     count = max(1, min(most, len(pairs) // WORTH_A_PROCESS))
-    blocks = [pairs[at : at + BLOCK] for at in range(0, len(pairs), BLOCK)]
-    with scratch_folder() as folder:
-        jobs = []
-        for number in range(count):
-            own = Path(folder, f"{number}")
-            own.mkdir()
-            share = [pair for block in blocks[number::count] for pair in block]
-            jobs.append(workers.Job(_match_in_chunks, (database, own, share, options.seed)))
-        if count == 1:
-            start = time.monotonic()
-            _match_in_chunks(advance, *jobs[0].arguments)
-            return Work(even_seconds=(time.monotonic() - start) / most)
-        outcomes = workers.run(jobs, count, advance, initialiser=engine.initialiser())
-    for outcome in outcomes:
-        if outcome.fault:
-            raise InputError(
-                f"Matching stopped: {outcome.fault.rstrip('.')}. What is matched stays in "
-                f"{database}; run the command again to go on."
-            )
-    return Work(even_seconds=sum(outcome.seconds for outcome in outcomes) / most)
+    busy = 0.0
+    with closing(_chunks(database, pairs, options.seed, count)) as chunks:
+        for matched, seconds in chunks:
+            advance(matched)
+            busy += seconds
+    return Work(even_seconds=busy / most)
 
 
-def _match_in_chunks(
-    advance: Callable[[int], None],
-    database: Path,
-    folder: Path,
-    pairs: Sequence[IdPair],
-    seed: int,
-) -> None:
-    """Match all pairs in chunks that take about `CHUNK_SECONDS`, each kept when done."""
-    size, at = FIRST_CHUNK, 0
-    while at < len(pairs):
-        chunk = pairs[at : at + size]
-        start = time.monotonic()
-        _match_apart(database, folder, chunk, seed)
-        advance(len(chunk))
-        at += len(chunk)
-        rate = len(chunk) / max(time.monotonic() - start, 1e-3)
-        size = int(min(max(rate * CHUNK_SECONDS, 1), 4 * size, MAX_CHUNK))
+def _chunks(
+    database: Path, pairs: Sequence[IdPair], seed: int, count: int
+) -> Generator[tuple[int, float], None, None]:
+    """Match all pairs in chunks; yield how many each had and how long it took, s."""
+    if count > 1:
+        return workers.results(
+            partial(_match_chunk, seed),
+            pairs,
+            count,
+            engine.initialiser(),
+            Source(database, part_of_pairs, rows_of_pairs, write_rows),
+            first=FIRST_CHUNK,
+            seconds=CHUNK_SECONDS,
+        )
+    return _chunks_here(database, Shares(pairs, FIRST_CHUNK, CHUNK_SECONDS), seed)
+
+
+def _chunks_here(
+    database: Path, shares: Shares[IdPair], seed: int
+) -> Generator[tuple[int, float], None, None]:
+    while shares:
+        matched, seconds = _match_chunk(seed, database, shares.next(1))
+        shares.learn(matched, seconds)
+        yield matched, seconds
+
+
+def _match_chunk(seed: int, database: Path, pairs: Sequence[IdPair]) -> tuple[int, float]:
+    start = time.monotonic()
+    try:
+        with scratch_folder() as folder:
+            _match_apart(database, folder, pairs, seed)
+    except (OSError, sqlite3.OperationalError) as fault:
+        raise InputError(
+            f"Matching stopped: {fault}. What is matched stays in {database}; run the command "
+            "again to go on."
+        ) from fault
+    return len(pairs), time.monotonic() - start
 
 
 def _match_apart(database: Path, folder: Path, pairs: Sequence[IdPair], seed: int) -> None:

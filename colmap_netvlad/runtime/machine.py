@@ -10,6 +10,8 @@ from pathlib import Path
 CGROUPS = Path("/sys/fs/cgroup")
 MEMBERSHIP = Path("/proc/self/cgroup")
 
+_allotted: int | None = None
+
 UNKNOWN_BYTES = 8 * 2.0**30
 """Memory that a machine is taken to have where it does not say."""
 
@@ -20,11 +22,19 @@ def usable_processors() -> int:
     Heeded are its affinity, and the quotas of the Linux control groups it is in (containers,
     batch systems), rounded up as loky's `cpu_count` does.
     """
+    if _allotted is not None:
+        return _allotted
     if hasattr(os, "sched_getaffinity"):
         processors = len(os.sched_getaffinity(0))
     else:
         processors = os.cpu_count() or 1
     return max(1, min([processors, *(math.ceil(quota) for quota in _processor_quotas())]))
+
+
+def allot(processors: int) -> None:
+    """Let this process use so many processors: it shares the machine with others of its kind."""
+    global _allotted
+    _allotted = processors
 
 
 def usable_memory() -> float:

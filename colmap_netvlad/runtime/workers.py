@@ -1,72 +1,52 @@
-"""Run jobs in processes of their own: one that crashes loses its own work only; or many small
-tasks in a few processes."""
+"""Who does the work that need not be done in this process: processes of this machine, unless
+`using` names others.
+
+Three ways: `run` for jobs of which one that crashes loses its own work only; `results` for many
+items, in shares; `stream` for items whose work keeps all processors of a machine busy by itself.
+"""
 
 from __future__ import annotations
 
-import contextlib
-import multiprocessing
-import os
-import signal
-import sys
-import threading
-import time
-from collections.abc import Callable, Generator, Iterable, Sequence
-from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor
-from concurrent.futures import wait as wait_for_any
-from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
-from itertools import islice
-from multiprocessing.connection import Connection, wait
-from multiprocessing.context import SpawnProcess
-from typing import Any, TypeVar
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 
-from colmap_netvlad.runtime.errors import InputError
+from colmap_netvlad.runtime.jobs import (
+    LIGHT,
+    Capacity,
+    Engine,
+    Item,
+    Job,
+    Load,
+    Outcome,
+    Result,
+    Shares,
+    Source,
+)
+from colmap_netvlad.runtime.processes import Processes
 
-POLL_SECONDS = 0.5
-"""How often progress is looked at."""
+HERE = Processes()
 
-KILL_SECONDS = 5.0
-"""How long a worker may take to end when told to."""
-
-AHEAD = 2
-"""Tasks at hand for each process that is asked for results: one at work, one to go on with."""
-
-KILLED = 9
-"""SIGKILL, which some systems have no name for."""
+_engine: Engine = HERE
 
 
-Task = TypeVar("Task")
-Result = TypeVar("Result")
-
-
-@dataclass(frozen=True)
-class Job:
-    """A module-level function that is called in a worker as `function(advance, *arguments)`.
-
-    `advance(count)` tells the parent that `count` more units are done.
-    """
-
-    function: Callable[..., None]
-    arguments: tuple[Any, ...]
-
-
-@dataclass
-class Outcome:
-    """How a job ended.
-
-    Attributes:
-        fault: why it failed, or None.
-        peak_bytes: the most memory its process held; 0 where it crashed.
-        seconds: how long its initialiser and function ran, s; 0 where its process crashed.
-    """
-
-    fault: str | None = None
-    peak_bytes: int = 0
-    seconds: float = 0.0
+@contextmanager
+def using(engine: Engine) -> Iterator[None]:
+    """Let `engine` do the work while the block runs."""
+    global _engine
+    before, _engine = _engine, engine
+    try:
+        yield
+    finally:
+        _engine = before
 
 
 def _nothing() -> None:
     pass
+
+
+def capacity() -> Capacity:
+    """Return what there is to work with."""
+    return _engine.capacity()
 
 
 def run(
@@ -76,7 +56,9 @@ def run(
     finished: Callable[[int, Outcome], None] = lambda number, outcome: None,
     initialiser: Callable[[], None] = _nothing,
 ) -> list[Outcome]:
-    """Run jobs in at most `workers` processes at a time and return how each ended.
+    """Run jobs, at most `workers` at a time, and return how each ended.
+
+    Jobs that do not name their files stay on this machine.
 
     Args:
         advance: is told the units done, of all jobs together.
@@ -86,126 +68,52 @@ def run(
 
     An exception in this process (Ctrl-C) ends all workers before it goes on.
     """
-    context = multiprocessing.get_context("spawn")
-    counters = [context.Value("q", 0) for _ in jobs]
-    outcomes = [Outcome() for _ in jobs]
-    running: dict[int, tuple[SpawnProcess, Connection]] = {}
-    waiting = list(range(len(jobs)))[::-1]
-    told = 0
-    try:
-        while waiting or running:
-            while waiting and len(running) < max(1, workers):
-                number = waiting.pop()
-                receiver, sender = context.Pipe(duplex=False)
-                process = context.Process(
-                    target=_work,
-                    args=(jobs[number], counters[number], sender, initialiser),
-                )
-                process.start()
-                sender.close()
-                running[number] = process, receiver
-            wait([process.sentinel for process, _ in running.values()], POLL_SECONDS)
-            done = sum(counter.value for counter in counters)
-            advance(done - told)
-            told = done
-            for number, (process, receiver) in list(running.items()):
-                if process.exitcode is None:
-                    continue
-                outcomes[number] = _outcome(process, receiver)
-                del running[number]
-                finished(number, outcomes[number])
-    finally:
-        for process, _ in running.values():
-            process.terminate()
-        for process, _ in running.values():
-            process.join(KILL_SECONDS)
-            if process.exitcode is None:
-                process.kill()
-                process.join()
-    return outcomes
-
-
-def _outcome(process: SpawnProcess, receiver: Connection) -> Outcome:
-    with contextlib.suppress(EOFError), receiver:
-        if receiver.poll():
-            return Outcome(*receiver.recv())
-    code = process.exitcode or 0
-    if code == -KILLED:
-        return Outcome("its process was killed, by the system for want of memory perhaps")
-    return Outcome(f"its process crashed (exit code {code})")
-
-
-def _work(job: Job, counter: Any, sender: Connection, initialiser: Callable[[], None]) -> None:
-    _begin()
-
-    def advance(count: int = 1) -> None:
-        with counter.get_lock():
-            counter.value += count
-
-    fault, start = None, time.monotonic()
-    try:
-        initialiser()
-        job.function(advance, *job.arguments)
-    except InputError as known:
-        fault = known.message
-    except Exception as unknown:
-        fault = f"{type(unknown).__name__}: {unknown}"
-    sender.send((fault, _peak_bytes(), time.monotonic() - start))
+    engine = _engine if all(job.files for job in jobs) else HERE
+    return engine.run(jobs, workers, advance, finished, initialiser)
 
 
 def results(
-    function: Callable[[Task], Result],
-    tasks: Iterable[Task],
+    function: Callable[..., Result],
+    items: Sequence[Item],
     workers: int,
     initialiser: Callable[[], None] = _nothing,
+    source: Source[Item] | None = None,
+    load: Load = LIGHT,
+    *,
+    first: int = 1,
+    seconds: float | None = None,
 ) -> Generator[Result, None, None]:
-    """Yield `function(task)` for every task as they are done, from `workers` processes.
+    """Yield `function(share)` for shares of the items as they are done, by `workers` processes.
 
-    For many small tasks, of which no more wait than are soon worked at. Functions and results are
-    sent between processes: module-level functions, or a `functools.partial` of one.
+    No more shares wait than are soon worked at. Functions and results are sent between processes:
+    module-level functions, or a `functools.partial` of one.
+
+    Args:
+        initialiser: is called once in each process.
+        source: what the function reads: its path is handed over before the share.
+        first: items of the first share.
+        seconds: how long a share should take; None: all have `first` items.
 
     Raises:
-        InputError: a process crashed or was killed. What a task raises is raised here. Either
+        InputError: a process crashed or was killed. What a share raises is raised here. Either
             ends the work; results that were ready come first.
     """
-    context = multiprocessing.get_context("spawn")
-    waiting = iter(tasks)
-    pool = ProcessPoolExecutor(workers, context, _begin, (initialiser,))
-    try:
-        running = {pool.submit(function, task) for task in islice(waiting, AHEAD * workers)}
-        while running:
-            done, running = wait_for_any(running, return_when=FIRST_COMPLETED)
-            for ended in sorted(done, key=lambda ended: ended.exception() is not None):
-                yield ended.result()
-            running |= {pool.submit(function, task) for task in islice(waiting, len(done))}
-    except BrokenProcessPool as fault:
-        raise InputError(
-            "A process of this run crashed or was killed, by the system for want of memory "
-            "perhaps; run the command again: it goes on where it stopped."
-        ) from fault
-    finally:
-        pool.shutdown(cancel_futures=True)
+    shares = Shares(items, first, seconds)
+    return _engine.results(function, shares, workers, initialiser, source, load)
 
 
-def _begin(initialiser: Callable[[], None] = _nothing) -> None:
-    # Ctrl-C reaches the whole group; the parent alone decides and ends its workers.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-    initialiser()
+def stream(
+    function: Callable[..., Iterable[Result]],
+    items: Sequence[Item],
+    initialiser: Callable[[], None] = _nothing,
+    source: Source[Item] | None = None,
+    load: Load = LIGHT,
+    *,
+    first: int = 1,
+) -> Generator[Result, None, None]:
+    """Yield what `function(share)` yields, for work that uses all processors by itself.
 
-
-def _end_with_parent() -> None:
-    """End this process when its parent is gone (killed, say): nobody waits for the result."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
-
-
-def _peak_bytes() -> int:
-    try:
-        import resource
-    except ImportError:  # Windows
-        return 0
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak if sys.platform == "darwin" else peak * 1024
+    On this machine all items are one share, in this process; other machines take shares of them.
+    Arguments and what is raised are as in `results`.
+    """
+    return _engine.stream(function, items, first, initialiser, source, load)

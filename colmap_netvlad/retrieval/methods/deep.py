@@ -4,8 +4,15 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from functools import lru_cache, partial
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
 
 from colmap_netvlad.cache.cells import Cells
 from colmap_netvlad.cache.photos import contents
@@ -17,8 +24,13 @@ from colmap_netvlad.photos.decode import load_batches
 from colmap_netvlad.photos.masks import find_mask
 from colmap_netvlad.retrieval.described import cache_note, missing, rank_described
 from colmap_netvlad.retrieval.options import RetrievalOptions
+from colmap_netvlad.runtime import workers
 from colmap_netvlad.runtime.errors import InputError
+from colmap_netvlad.runtime.jobs import Enclosed, Load
 from colmap_netvlad.runtime.progress import step
+
+if TYPE_CHECKING:
+    from colmap_netvlad.models.describe import DescriptorModel
 
 BATCH_SIZE = 8
 
@@ -136,28 +148,58 @@ def _describe(
     """Describe photos into the store, a transaction a batch; return (name -> reason) of the bad."""
     if not names:
         return {}
+    seen = (folder,) if options.masks is None else (folder, options.masks)
+    described = workers.stream(
+        partial(_describe_share, Enclosed(checkpoint), folder, options),
+        names,
+        load=Load(gpu=(options.device or "cuda").startswith("cuda"), seen=seen),
+        first=options.batch_size or BATCH_SIZE,
+    )
+    bad: dict[str, str] = {}
+    start = time.perf_counter()
+    try:
+        with step("Describing photos", len(names)) as bar, closing(described) as batches:
+            for batch in batches:
+                bad |= dict(batch.bad)
+                if batch.names:
+                    done, fingerprints = time.perf_counter(), [photos[n] for n in batch.names]
+                    store.add_descriptors(
+                        key, batch.names, fingerprints, batch.vectors, done - start, batch.cells
+                    )
+                    # Waiting for the decoders belongs to the next batch's time.
+                    start = done
+                bar.advance(len(batch.names) + len(batch.bad))
+    finally:
+        _network.cache_clear()
+    return bad
+
+
+@dataclass(frozen=True, eq=False)
+class _Described:
+    """Some photos: their descriptors, their cells where asked for; (name, reason) of the bad."""
+
+    names: tuple[str, ...]
+    vectors: NDArray[np.float32]
+    cells: list[Cells]
+    bad: list[tuple[str, str]]
+
+
+def _describe_share(
+    checkpoint: Enclosed, folder: Path, options: RetrievalOptions, names: Sequence[str]
+) -> Iterator[_Described]:
+    """Describe photos batch by batch."""
+    network = _network(checkpoint, options.device)
+    size = options.batch_size or BATCH_SIZE
+    for batch in load_batches(folder, names, network.long_side, size, masks=options.masks):
+        vectors, maps = network.describe_with_cells(batch.pixels)
+        cells = [Cells.of(features) for features in maps] if options.rerank else []
+        yield _Described(batch.names, vectors, cells, batch.bad)
+
+
+@lru_cache(maxsize=1)
+def _network(checkpoint: Enclosed, device: str | None) -> DescriptorModel:
+    """Load a model once a process."""
     from colmap_netvlad.models.checkpoint import load_model
 
-    network = load_model(checkpoint, options.device)
-    bad: dict[str, str] = {}
-    batches = load_batches(
-        folder,
-        names,
-        network.long_side,
-        options.batch_size or BATCH_SIZE,
-        masks=options.masks,
-    )
-    start = time.perf_counter()
-    with step("Describing photos", len(names)) as bar:
-        for batch in batches:
-            bad |= dict(batch.bad)
-            if batch.names:
-                vectors, maps = network.describe_with_cells(batch.pixels)
-                cells = [Cells.of(features) for features in maps] if options.rerank else []
-                done = time.perf_counter()
-                seen = [photos[name] for name in batch.names]
-                store.add_descriptors(key, batch.names, seen, vectors, done - start, cells)
-                # Waiting for the decoders belongs to the next batch's time.
-                start = done
-            bar.advance(len(batch.names) + len(batch.bad))
-    return bad
+    with checkpoint.opened() as path:
+        return load_model(path, device)

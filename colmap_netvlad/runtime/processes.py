@@ -1,0 +1,202 @@
+"""Processes of this machine: one for each job, or a few for many shares."""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Generator, Iterable, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor
+from concurrent.futures import wait as wait_for_any
+from concurrent.futures.process import BrokenProcessPool
+from functools import partial
+from multiprocessing.connection import Connection, wait
+from multiprocessing.context import SpawnProcess
+from typing import Any
+
+from colmap_netvlad.runtime.errors import InputError
+from colmap_netvlad.runtime.jobs import (
+    AHEAD,
+    Capacity,
+    Item,
+    Job,
+    Load,
+    Outcome,
+    Result,
+    Shares,
+    Source,
+)
+from colmap_netvlad.runtime.machine import usable_memory, usable_processors
+
+POLL_SECONDS = 0.5
+"""How often progress is looked at."""
+
+KILL_SECONDS = 5.0
+"""How long a worker may take to end when told to."""
+
+KILLED = 9
+"""SIGKILL, which some systems have no name for."""
+
+
+class Processes:
+    """This machine, as `jobs.Engine`."""
+
+    def capacity(self) -> Capacity:
+        """Return what this process may use."""
+        processors = usable_processors()
+        return Capacity(processors, usable_memory(), processors)
+
+    def run(
+        self,
+        jobs: Sequence[Job],
+        workers: int,
+        advance: Callable[[int], None],
+        finished: Callable[[int, Outcome], None],
+        initialiser: Callable[[], None],
+    ) -> list[Outcome]:
+        """Run each job in a process of its own."""
+        context = multiprocessing.get_context("spawn")
+        counters = [context.Value("q", 0) for _ in jobs]
+        outcomes = [Outcome() for _ in jobs]
+        running: dict[int, tuple[SpawnProcess, Connection]] = {}
+        waiting = list(range(len(jobs)))[::-1]
+        told = 0
+        try:
+            while waiting or running:
+                while waiting and len(running) < max(1, workers):
+                    number = waiting.pop()
+                    receiver, sender = context.Pipe(duplex=False)
+                    process = context.Process(
+                        target=_work,
+                        args=(jobs[number], counters[number], sender, initialiser),
+                    )
+                    process.start()
+                    sender.close()
+                    running[number] = process, receiver
+                wait([process.sentinel for process, _ in running.values()], POLL_SECONDS)
+                done = sum(counter.value for counter in counters)
+                advance(done - told)
+                told = done
+                for number, (process, receiver) in list(running.items()):
+                    if process.exitcode is None:
+                        continue
+                    outcomes[number] = _outcome(process, receiver)
+                    del running[number]
+                    finished(number, outcomes[number])
+        finally:
+            for process, _ in running.values():
+                process.terminate()
+            for process, _ in running.values():
+                process.join(KILL_SECONDS)
+                if process.exitcode is None:
+                    process.kill()
+                    process.join()
+        return outcomes
+
+    def results(
+        self,
+        function: Callable[..., Result],
+        shares: Shares[Item],
+        workers: int,
+        initialiser: Callable[[], None],
+        source: Source[Item] | None,
+        load: Load,
+    ) -> Generator[Result, None, None]:
+        """Work at shares in a pool of processes."""
+        called = function if source is None else partial(function, source.path)
+        context = multiprocessing.get_context("spawn")
+        pool = ProcessPoolExecutor(workers, context, _begin, (initialiser,))
+        running: dict[Future[tuple[float, Result]], int] = {}
+        try:
+            while shares or running:
+                while shares and len(running) < AHEAD * workers:
+                    share = shares.next(workers)
+                    running[pool.submit(_timed, called, share)] = len(share)
+                done, _ = wait_for_any(running, return_when=FIRST_COMPLETED)
+                for ended in sorted(done, key=lambda ended: ended.exception() is not None):
+                    seconds, result = ended.result()
+                    shares.learn(running.pop(ended), seconds)
+                    yield result
+        except BrokenProcessPool as fault:
+            raise InputError(
+                "A process of this run crashed or was killed, by the system for want of memory "
+                "perhaps; run the command again: it goes on where it stopped."
+            ) from fault
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+    def stream(
+        self,
+        function: Callable[..., Iterable[Result]],
+        items: Sequence[Item],
+        first: int,
+        initialiser: Callable[[], None],
+        source: Source[Item] | None,
+        load: Load,
+    ) -> Generator[Result, None, None]:
+        """Work at all items in this process."""
+        called = function if source is None else partial(function, source.path)
+        yield from called(items)
+
+
+def _timed(function: Callable[..., Result], share: Sequence[Item]) -> tuple[float, Result]:
+    start = time.monotonic()
+    result = function(share)
+    return time.monotonic() - start, result
+
+
+def _outcome(process: SpawnProcess, receiver: Connection) -> Outcome:
+    with contextlib.suppress(EOFError), receiver:
+        if receiver.poll():
+            return Outcome(*receiver.recv())
+    code = process.exitcode or 0
+    if code == -KILLED:
+        return Outcome("its process was killed, by the system for want of memory perhaps")
+    return Outcome(f"its process crashed (exit code {code})")
+
+
+def _work(job: Job, counter: Any, sender: Connection, initialiser: Callable[[], None]) -> None:
+    _begin(lambda: None)
+
+    def advance(count: int = 1) -> None:
+        with counter.get_lock():
+            counter.value += count
+
+    fault, start = None, time.monotonic()
+    try:
+        initialiser()
+        job.function(advance, *job.files, *job.arguments)
+    except InputError as known:
+        fault = known.message
+    except Exception as unknown:
+        fault = f"{type(unknown).__name__}: {unknown}"
+    sender.send((fault, peak_bytes(), time.monotonic() - start))
+
+
+def _begin(initialiser: Callable[[], None]) -> None:
+    # Ctrl-C reaches the whole group; the parent alone decides and ends its workers.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    initialiser()
+
+
+def _end_with_parent() -> None:
+    """End this process when its parent is gone (killed, say): nobody waits for the result."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
+def peak_bytes() -> int:
+    """Return the most memory that this process held; 0 where nobody knows."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return 0
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024

@@ -1,0 +1,385 @@
+"""Work done by the machines of a Ray cluster; Ray is connected (`runtime.cluster`).
+
+Ray's tasks, not its actors: a task that is lost with its machine runs again on any other, machines
+may join and leave, and nobody holds a place for nothing. What an actor would load in its
+constructor a process keeps between tasks (`_order`).
+
+Retried is what a machine did: a process or machine that is lost, an I/O fault. What our own code
+says of its input is not. A loop over `ray.wait` keeps few shares under way, and fewer where the
+parts of the database that they carry would fill this machine's object store.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import socket
+import time
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import ray
+from ray.exceptions import RayError, RayTaskError
+
+from colmap_netvlad.runtime import machine
+from colmap_netvlad.runtime.errors import InputError
+from colmap_netvlad.runtime.files import scratch_folder
+from colmap_netvlad.runtime.jobs import (
+    AHEAD,
+    Capacity,
+    Item,
+    Job,
+    Load,
+    Outcome,
+    Result,
+    Shares,
+    Source,
+)
+from colmap_netvlad.runtime.processes import peak_bytes
+from colmap_netvlad.runtime.version import VERSION
+
+logger = logging.getLogger(__name__)
+
+TASK_SECONDS = 30.0
+"""How long a task should take: long beside Ray's milliseconds, short beside a machine's life."""
+
+RETRIES = 3
+"""How often a task is run again whose process or machine is lost."""
+
+CALLS = 100
+"""Tasks after which a process is replaced: native libraries leak. Ray's own choice for tasks on
+a GPU is 1, with which each would load its model."""
+
+POLL_SECONDS = 0.5
+"""How long to wait for a task before looking at Ctrl-C and at the machines."""
+
+STORE_SHARE = 0.5
+"""Share of this machine's object store that waiting parts of the database may take."""
+
+ALONE_SECONDS = 60.0
+"""How long to wait for a machine when none is left."""
+
+
+@dataclass(frozen=True)
+class Order:
+    """What all tasks of one piece of work have in common."""
+
+    function: Callable[..., Any]
+    initialiser: Callable[[], None]
+    take: Callable[[Path, Sequence[Any]], Any] | None
+    load: Load
+    version: str = VERSION
+
+
+@dataclass
+class Done:
+    """What a task hands back.
+
+    Attributes:
+        value: what the function returned.
+        taken: what was written into its part of the database.
+        seconds: how long the function ran, s.
+    """
+
+    value: Any
+    taken: Any
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Call:
+    """One task: a share, and who writes its part of the database."""
+
+    share: Sequence[Any]
+    part: Callable[[Path], None] | None = None
+
+
+@dataclass
+class JobDone:
+    """What a job hands back: how it ended, the units done, its files by relative path."""
+
+    outcome: Outcome
+    units: int = 0
+    files: dict[str, bytes] = field(default_factory=dict)
+
+
+class RayTasks:
+    """The machines of a cluster, as `jobs.Engine`."""
+
+    def capacity(self) -> Capacity:
+        """Return what the machines offer."""
+        machines = [resources.get("CPU", 0) for resources in _machines()]
+        memory = sum(resources.get("memory", 0) for resources in _machines())
+        return Capacity(max(1, int(sum(machines))), memory, max(1, int(max(machines, default=1))))
+
+    def results(
+        self,
+        function: Callable[..., Result],
+        shares: Shares[Item],
+        workers: int,
+        initialiser: Callable[[], None],
+        source: Source[Item] | None,
+        load: Load,
+    ) -> Generator[Result, None, None]:
+        """Work at each share in a task."""
+        shares.lengthen(TASK_SECONDS)
+        load = _fitting(load)
+        order = Order(function, initialiser, source.take if source else None, load)
+        with contextlib.closing(_tasks(order, _calls(shares, source, load))) as tasks:
+            for call, done in tasks:
+                if isinstance(done, Exception):
+                    raise done
+                shares.learn(len(call.share), done.seconds)
+                if source is not None and source.keep is not None:
+                    source.keep(source.path, done.taken)
+                yield done.value
+
+    def stream(
+        self,
+        function: Callable[..., Iterable[Result]],
+        items: Sequence[Item],
+        first: int,
+        initialiser: Callable[[], None],
+        source: Source[Item] | None,
+        load: Load,
+    ) -> Generator[Result, None, None]:
+        """Work at each share in a task."""
+        shares = Shares(items, first, TASK_SECONDS)
+        listed = partial(_listed, function)
+        with contextlib.closing(
+            self.results(listed, shares, 0, initialiser, source, load)
+        ) as results:
+            for result in results:
+                yield from result
+
+    def run(
+        self,
+        jobs: Sequence[Job],
+        workers: int,
+        advance: Callable[[int], None],
+        finished: Callable[[int, Outcome], None],
+        initialiser: Callable[[], None],
+    ) -> list[Outcome]:
+        """Work at each job in a task; progress is told as it ends."""
+        outcomes = [Outcome() for _ in jobs]
+        if not jobs:
+            return outcomes
+        calls = (_call_of(number, job) for number, job in enumerate(jobs))
+        order = Order(_do_job, initialiser, None, _fitting(jobs[0].load))
+        with contextlib.closing(_tasks(order, calls)) as tasks:
+            for call, done in tasks:
+                (number, *_) = call.share[0]
+                if isinstance(done, Exception):
+                    outcomes[number] = Outcome(str(done))
+                else:
+                    outcomes[number] = done.value.outcome
+                    advance(done.value.units)
+                    _write_files(jobs[number].files[1], done.value.files)
+                finished(number, outcomes[number])
+        return outcomes
+
+
+def _calls(shares: Shares[Item], source: Source[Item] | None, load: Load) -> Iterator[Call]:
+    while shares:
+        share = shares.next(max(1, _slots(load)))
+        yield Call(share, None if source is None else partial(source.part, source.path, share))
+
+
+def _call_of(number: int, job: Job) -> Call:
+    assert job.source is not None  # `workers.run` keeps other jobs on this machine
+    part = partial(job.source.part, job.source.path, job.arguments)
+    return Call([(number, job.function, job.arguments)], part)
+
+
+def _tasks(
+    order: Order, calls: Iterator[Call]
+) -> Generator[tuple[Call, Done | Exception], None, None]:
+    """Yield calls and what they handed back, or why they failed, as they end."""
+    load = order.load
+    task = ray.remote(
+        num_cpus=load.processors,
+        num_gpus=int(load.gpu),
+        memory=load.memory,
+        max_calls=CALLS,
+        max_retries=RETRIES,
+        retry_exceptions=[OSError, MemoryError],
+    )(work)
+    reference = ray.put(order)
+    running: dict[Any, tuple[Call, Any, int]] = {}  # the part stays while its task may be retried
+    store = STORE_SHARE * _own_store()
+    waiting: Call | None = next(calls, None)
+    slots, looked, lonely = _slots(load), time.monotonic(), 0.0
+    try:
+        while waiting is not None or running:
+            while (
+                waiting is not None
+                and len(running) < max(1, AHEAD * slots)
+                and (sum(size for *_, size in running.values()) < store or not running)
+            ):
+                part = _part(waiting)
+                stored = None if part is None else ray.put(part)
+                started = task.remote([reference], waiting.share, stored)
+                running[started] = waiting, stored, len(part or b"")
+                waiting = next(calls, None)
+            ready, _ = ray.wait(list(running), timeout=POLL_SECONDS)
+            for ended in ready:
+                call, *_ = running.pop(ended)
+                yield call, _handed_back(ended)
+            now = time.monotonic()
+            if now - looked > POLL_SECONDS:
+                slots = _slots(load)
+                lonely = 0.0 if slots or ready else lonely + now - looked
+                looked = now
+            if lonely > ALONE_SECONDS:
+                raise InputError(
+                    "No machine of the cluster is left that could do the work; what was done "
+                    "stays. Start some and run the command again."
+                )
+    finally:
+        for left in running:
+            with contextlib.suppress(Exception):
+                ray.cancel(left, force=True)
+
+
+def _part(call: Call) -> bytes | None:
+    if call.part is None:
+        return None
+    with scratch_folder() as folder:
+        target = folder / "part.db"
+        call.part(target)
+        return target.read_bytes()
+
+
+def _handed_back(ended: Any) -> Done | Exception:
+    try:
+        done: Done = ray.get(ended)
+        return done
+    except RayTaskError as fault:
+        cause = fault.cause
+        if isinstance(cause, InputError):
+            return InputError(cause.message)
+        return cause if isinstance(cause, Exception) else fault
+    except RayError as fault:
+        return InputError(
+            f"A task was lost {RETRIES + 1} times with its process or machine "
+            f"({type(fault).__name__}), for want of memory perhaps; what was done stays: run the "
+            "command again."
+        )
+
+
+def _machines() -> list[dict[str, float]]:
+    return [machine["Resources"] for machine in ray.nodes() if machine["Alive"]]
+
+
+def _own_store() -> float:
+    own = ray.get_runtime_context().get_node_id()
+    (resources,) = (node["Resources"] for node in ray.nodes() if node["NodeID"] == own)
+    return float(resources.get("object_store_memory", 0))
+
+
+def _fitting(load: Load) -> Load:
+    """Return a load that some machine can take: no more than the largest has."""
+    machines = _machines()
+    with_gpu = [resources for resources in machines if resources.get("GPU", 0) >= 1]
+    if load.gpu and with_gpu:
+        each = min(int(resources.get("CPU", 1) // resources["GPU"]) for resources in with_gpu)
+        return Load(max(1, each), 0.0, True, load.seen)
+    most = max((resources.get("CPU", 0) for resources in machines), default=1)
+    memory = max((resources.get("memory", 0) for resources in machines), default=0.0)
+    processors = max(1, min(load.processors, int(most)))
+    return Load(processors, int(min(load.memory, memory)), False, load.seen)
+
+
+def _slots(load: Load) -> int:
+    """Return how many tasks of a load the machines can do at once."""
+    wanted = {"CPU": load.processors, "memory": load.memory, "GPU": int(load.gpu)}
+    return sum(
+        int(min(resources.get(kind, 0) // count for kind, count in wanted.items() if count))
+        for resources in _machines()
+    )
+
+
+# What runs on the other machines
+
+_kept: tuple[str, Order] | None = None
+"""The order this process works at; its initialiser was called."""
+
+
+def work(references: list[Any], share: Sequence[Any], part: bytes | None) -> Done:
+    """Do a task: one share of an order (in a worker of Ray)."""
+    order = _order(references[0])
+    for path in order.load.seen:
+        if not path.exists():
+            raise InputError(
+                f"The machine {_own_name()} of the cluster does not see {path}; put it on storage "
+                "that all machines see under the same path."
+            )
+    with contextlib.ExitStack() as stack:
+        files: list[Path] = []
+        if part is not None:
+            files.append(stack.enter_context(scratch_folder()) / "part.db")
+            files[0].write_bytes(part)
+        start = time.monotonic()
+        value = order.function(*files, share)
+        seconds = time.monotonic() - start
+        taken = None if order.take is None else order.take(files[0], share)
+    return Done(value, taken, seconds)
+
+
+def _order(reference: Any) -> Order:
+    """Return the order, fetched once by this process, which is made ready for it."""
+    global _kept
+    if _kept is None or _kept[0] != reference.hex():
+        order: Order = ray.get(reference)
+        if order.version != VERSION:
+            raise InputError(
+                f"The machine {_own_name()} of the cluster has colmap-netvlad {VERSION}, the one "
+                f"that asks {order.version}; install the same on all."
+            )
+        machine.allot(order.load.processors)
+        order.initialiser()
+        _kept = reference.hex(), order
+    return _kept[1]
+
+
+def _own_name() -> str:
+    return f"{socket.gethostname()} ({ray.util.get_node_ip_address()})"
+
+
+def _listed(function: Callable[..., Iterable[Result]], *arguments: Any) -> list[Result]:
+    return list(function(*arguments))
+
+
+def _do_job(part: Path, share: Sequence[Any]) -> JobDone:
+    ((_, function, arguments),) = share
+    units = 0
+
+    def advance(count: int = 1) -> None:
+        nonlocal units
+        units += count
+
+    start, fault = time.monotonic(), None
+    with scratch_folder() as folder:
+        try:
+            function(advance, part, folder, *arguments)
+        except InputError as known:
+            fault = known.message
+        except Exception as unknown:
+            fault = f"{type(unknown).__name__}: {unknown}"
+        outcome = Outcome(fault, peak_bytes(), time.monotonic() - start)
+        return JobDone(outcome, units, {} if fault else _read_files(folder))
+
+
+def _read_files(folder: Path) -> dict[str, bytes]:
+    files = (path for path in sorted(folder.rglob("*")) if path.is_file())
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
+
+
+def _write_files(folder: Path, files: dict[str, bytes]) -> None:
+    for name, content in files.items():
+        target = folder / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_bytes(content)
