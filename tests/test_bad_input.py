@@ -307,7 +307,7 @@ def test_sigterm_stops_as_ctrl_c_does(project_copy: MakeProject) -> None:
         "from colmap_netvlad.cli import main\nsys.argv[1:] = sys.argv[2:]\nmain()",
     )
     arguments = ["pairs", "--db", str(project.database), "--method", "bow", "--k", "3"]
-    stage = "colmap_netvlad.runtime.workers:wait"
+    stage = "colmap_netvlad.runtime.processes:wait"
     done = subprocess.run(
         [sys.executable, "-c", script, stage, *arguments],
         capture_output=True,
@@ -322,7 +322,7 @@ def test_ctrl_c_while_a_vocabulary_tree_is_built_is_clean(project_copy: MakeProj
     project = project_copy()
     arguments = ("pairs", "--db", project.database, "--method", "bow", "--k", 3)
     before = content(project.folder)
-    interrupted("colmap_netvlad.runtime.workers:wait", *arguments)  # in its own process
+    interrupted("colmap_netvlad.runtime.processes:wait", *arguments)  # in its own process
     assert_no_leftovers(project.folder)
     assert content(project.folder).items() >= before.items()
     assert run(*arguments).exit_code == 0 and project.pairs.exists()

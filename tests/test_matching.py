@@ -9,7 +9,6 @@ import time
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 import pytest
 from hypothesis import given
@@ -18,12 +17,12 @@ from hypothesis import strategies as st
 from colmap_netvlad.colmap import engine
 from colmap_netvlad.colmap.copies import copy_matches
 from colmap_netvlad.colmap.database import image_names, open_database, pair_id
+from colmap_netvlad.graph.pair import IdPair
 from colmap_netvlad.matching import colmap as matching
 from colmap_netvlad.matching import run as asked_pairs
 from colmap_netvlad.matching.options import MatchOptions
 from colmap_netvlad.matching.run import match_pairs
 from colmap_netvlad.project import Project
-from colmap_netvlad.runtime import workers
 from colmap_netvlad.runtime.errors import InputError
 
 MakeProject = Callable[..., Project]
@@ -108,7 +107,7 @@ def test_several_processes_give_the_same_matches_as_one(
     one, two = (project_copy(name=name).database for name in ("one", "two"))
     match_pairs(one, some_pairs(one, 6), MatchOptions(processes=1))
     monkeypatch.setattr(matching, "WORTH_A_PROCESS", 5)
-    monkeypatch.setattr(matching, "BLOCK", 2)
+    monkeypatch.setattr(matching, "FIRST_CHUNK", 2)
     report = match_pairs(two, some_pairs(two, 6), MatchOptions(processes=3))
     assert report.matched == 15
     assert results(one) == results(two) and len(results(two)) == 15
@@ -137,19 +136,26 @@ def test_a_process_waits_while_another_writes(project_copy: MakeProject) -> None
     assert results(target)[two] == results(database)[two]
 
 
+match_chunk = matching._match_chunk
+
+
+def match_the_first_only(seed: int, database: Path, pairs: list[IdPair]) -> tuple[int, float]:
+    if (1, 2) not in pairs:
+        matching.copy_features = full_disk  # in a process of its own
+    return match_chunk(seed, database, pairs)
+
+
+def full_disk(*arguments: object) -> None:
+    raise OSError(28, "No space left on device")
+
+
 def test_a_failing_process_is_said_and_leaves_what_is_matched(
     project_copy: MakeProject, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     database = project_copy().database
     monkeypatch.setattr(matching, "WORTH_A_PROCESS", 5)
-    monkeypatch.setattr(matching, "BLOCK", 5)
-    run = workers.run
-
-    def without_the_second_folder(jobs: list[workers.Job], *others: Any, **options: Any) -> Any:
-        jobs[1].arguments[1].rmdir()
-        return run(jobs, *others, **options)
-
-    monkeypatch.setattr(workers, "run", without_the_second_folder)
+    monkeypatch.setattr(matching, "FIRST_CHUNK", 5)
+    monkeypatch.setattr(matching, "_match_chunk", match_the_first_only)
     with pytest.raises(InputError, match="run the command again"):
         match_pairs(database, some_pairs(database, 5), MatchOptions(processes=2))
     assert len(results(database)) == 5

@@ -2,8 +2,10 @@
 
 import logging
 import os
+import pickle
 from collections.abc import Callable, Iterator
 from functools import partial
+from pathlib import Path
 
 import pycolmap
 import pytest
@@ -11,7 +13,7 @@ import pytest
 from colmap_netvlad.colmap import engine
 from colmap_netvlad.runtime import workers
 from colmap_netvlad.runtime.errors import InputError
-from colmap_netvlad.runtime.workers import Job
+from colmap_netvlad.runtime.jobs import AHEAD, Enclosed, Job, Shares, Source
 
 
 def succeed(advance: Callable[[int], None], count: int) -> None:
@@ -97,40 +99,96 @@ def test_a_worker_is_as_talkative_as_its_parent(monkeypatch) -> None:
     assert said == ["20 3", "10 0"]
 
 
-def double(number: int) -> int:
-    if number < 0:
-        raise InputError(f"{number} is negative.")
-    return 2 * number
+def double(numbers: list[int]) -> list[int]:
+    if min(numbers) < 0:
+        raise InputError(f"{min(numbers)} is negative.")
+    return [2 * number for number in numbers]
 
 
-def die_at(at: int, number: int) -> int:
-    if number == at:
+def die_at(at: int, numbers: list[int]) -> list[int]:
+    if at in numbers:
         os.kill(os.getpid(), 9)
-    return number
+    return numbers
 
 
-def test_results_of_many_tasks_come_from_few_processes() -> None:
-    taken = []
+class Watched(list[int]):
+    """Says how far it was read."""
 
-    def tasks() -> Iterator[int]:
-        for number in range(40):
-            taken.append(number)
-            yield number
+    taken = 0
 
-    results = workers.results(double, tasks(), 2)
+    def __getitem__(self, part):  # type: ignore[override, no-untyped-def]
+        self.taken = max(self.taken, part.stop)
+        return super().__getitem__(part)
+
+
+def test_results_of_many_shares_come_from_few_processes() -> None:
+    numbers = Watched(range(40))
+    results = workers.results(double, numbers, 2)
     first = next(results)
-    assert len(taken) <= 2 * workers.AHEAD + 2  # no more wait than are soon worked at
-    assert sorted([first, *results]) == list(range(0, 80, 2))
+    assert numbers.taken <= 2 * AHEAD + 2  # no more wait than are soon worked at
+    assert sorted([*first, *(number for result in results for number in result)]) == list(
+        range(0, 80, 2)
+    )
 
 
-def test_what_a_task_raises_ends_the_work() -> None:
+def test_what_a_share_raises_ends_the_work() -> None:
     with pytest.raises(InputError, match=r"-1 is negative\."):
         list(workers.results(double, [1, 2, -1, *range(100)], 1))
 
 
 def test_a_process_that_is_killed_is_said_and_results_before_it_come() -> None:
-    came = []
+    came: list[int] = []
     with pytest.raises(InputError, match="crashed or was killed"):
         for result in workers.results(partial(die_at, 5), range(9), 1):
-            came.append(result)
+            came += result
     assert came and 5 not in came
+
+
+def test_shares_grow_until_they_take_as_long_as_they_should_and_end_small() -> None:
+    shares, sizes = Shares(range(10_000), first=10, seconds=30.0), []
+    while shares:
+        share = shares.next(workers=4)
+        sizes.append(len(share))
+        shares.learn(len(share), len(share) * 0.03)  # 1,000 would take 30 s
+    assert sum(sizes) == 10_000
+    assert sizes[:5] == [10, 40, 160, 640, 1000]
+    assert sizes[-2] == 10, "all workers end together"
+
+
+def test_shares_of_a_fixed_size() -> None:
+    shares = Shares("abcdefgh", first=3, seconds=None)
+    assert [shares.next(1), shares.next(1), shares.next(1), bool(shares)] == ["abc", "def", "gh", 0]
+
+
+def read_part(path: Path, share: list[int]) -> str:
+    return f"{path.name} {share}"
+
+
+def test_this_machine_s_processes_work_at_the_source_itself(tmp_path: Path) -> None:
+    def refuse(*arguments: object) -> None:
+        raise AssertionError("a part was made")
+
+    source = Source(tmp_path / "whole.db", refuse)
+    (result,) = workers.results(read_part, [1, 2], 1, source=source, first=2)
+    assert result == "whole.db [1, 2]"
+
+
+def test_a_stream_is_one_share_of_this_process() -> None:
+    def count(share: list[int]) -> Iterator[int]:
+        yield len(share)
+        yield os.getpid()
+
+    assert list(workers.stream(count, [1, 2, 3])) == [3, os.getpid()]
+
+
+def test_an_enclosed_file_goes_along_when_it_is_sent(tmp_path: Path) -> None:
+    path = tmp_path / "model.bin"
+    path.write_bytes(b"weights")
+    here = Enclosed(path)
+    with here.opened() as opened:
+        assert opened == path
+    there = pickle.loads(pickle.dumps(here))
+    path.unlink()
+    with there.opened() as opened:
+        assert opened.name == "model.bin" and opened.read_bytes() == b"weights"
+    assert not opened.exists()

@@ -21,7 +21,6 @@ from colmap_netvlad.colmap.copies import (
     write_rows,
 )
 from colmap_netvlad.colmap.database import open_database, pair_id
-from colmap_netvlad.graph.pair import IdPair
 
 IMPORTED = ("images", "frames", "frame_data", "pose_priors")
 """Tables that an import of photos writes, beside those of cameras."""
@@ -30,13 +29,13 @@ COUNTED = ("cameras", "rigs", "images", "frames")
 """Tables in which sqlite counts the ids."""
 
 
-def part_of_pairs(database: Path, pairs: Sequence[IdPair], target: Path) -> None:
+def part_of_pairs(database: Path, pairs: Sequence[tuple[int, int]], target: Path) -> None:
     """Write what matching needs of some pairs: cameras and features of their images."""
     engine.make_or_migrate(target)
     copy_features(database, target, {number: f"image{number}" for pair in pairs for number in pair})
 
 
-def rows_of_pairs(part: Path, pairs: Sequence[IdPair]) -> Rows:
+def rows_of_pairs(part: Path, pairs: Sequence[tuple[int, int]]) -> Rows:
     """Return matches and two-view geometries of some pairs."""
     ids = [pair_id(*pair) for pair in pairs]
     return read_rows(part, dict.fromkeys(MATCHES, ("pair_id", ids)))

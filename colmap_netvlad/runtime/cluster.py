@@ -44,6 +44,8 @@ def on_cluster(address: str = "auto") -> Iterator[None]:
             "Work on many machines needs Ray, which is not installed here; install it with "
             '`pip install "colmap-netvlad[cluster]"`.'
         ) from fault
+    if address != "auto":
+        _check_address(address)
     connected_before = ray.is_initialized()
     if not connected_before:
         _connect(ray, address)
@@ -57,8 +59,6 @@ def on_cluster(address: str = "auto") -> Iterator[None]:
 
 
 def _connect(ray: Any, address: str) -> None:
-    if address != "auto":
-        _check_address(address)
     before = signal.getsignal(signal.SIGTERM)
     try:
         ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
@@ -131,11 +131,12 @@ def _check_machines(ray: Any) -> None:
         name = asked[answer]
         try:
             found = ray.get(answer)
-        except ray.exceptions.RayError as fault:
+        except ray.exceptions.RayTaskError as fault:
             raise InputError(
-                f"The machine {name} of the cluster went away or cannot work with this one "
-                f"({type(fault).__name__})."
+                f"The machine {name} of the cluster cannot work with this one: {fault.cause}"
             ) from fault
+        except ray.exceptions.RayError:
+            continue  # it has just gone away
         if isinstance(found, str):
             raise InputError(
                 f"The machine {name} of the cluster lacks colmap-netvlad ({found}); install "

@@ -259,8 +259,11 @@ def _handed_back(ended: Any) -> Done | Exception:
         return done
     except RayTaskError as fault:
         cause = fault.cause
-        if isinstance(cause, InputError):
-            return InputError(cause.message)
+        if isinstance(cause, RayError):  # it could not even begin
+            return InputError(
+                "A machine of the cluster cannot do this work; compare what is installed there: "
+                f"{str(cause).strip().splitlines()[0]}"
+            )
         return cause if isinstance(cause, Exception) else fault
     except RayError as fault:
         return InputError(

@@ -1,0 +1,370 @@
+"""Many machines: three nodes of a real Ray cluster, one of which is killed in every stage."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import sqlite3
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+import pytest
+from click.testing import CliRunner, Result
+
+from colmap_netvlad.cache.store import Store
+from colmap_netvlad.cli import cli
+from colmap_netvlad.colmap.database import image_names, open_database
+from colmap_netvlad.colmap.features import FeatureOptions, extract_features
+from colmap_netvlad.demo.render import RenderedFlight
+from colmap_netvlad.graph.viewgraph import read_view_graph
+from colmap_netvlad.mapping import parallel
+from colmap_netvlad.mapping.options import MappingOptions
+from colmap_netvlad.mapping.partition import partition
+from colmap_netvlad.matching import blocks
+from colmap_netvlad.matching import colmap as matching
+from colmap_netvlad.matching.options import MatchOptions
+from colmap_netvlad.matching.run import match_pairs
+from colmap_netvlad.project import Project
+from colmap_netvlad.retrieval.options import RetrievalOptions
+from colmap_netvlad.retrieval.rank import rank_project
+from colmap_netvlad.runtime import cluster, workers
+from colmap_netvlad.runtime.cluster import on_cluster
+from colmap_netvlad.runtime.errors import InputError
+from colmap_netvlad.runtime.jobs import Job, Source
+
+ray = pytest.importorskip("ray", reason="Ray is not installed: pip install colmap-netvlad[cluster]")
+ray_tasks = pytest.importorskip("colmap_netvlad.runtime.ray_tasks")
+cluster_utils = pytest.importorskip("ray.cluster_utils")
+
+pytestmark = pytest.mark.xdist_group("ray")
+
+MakeProject = Callable[..., Project]
+NODE = {"num_cpus": 1, "object_store_memory": 80 * 2**20}
+QUICK_TO_MISS = {
+    "health_check_initial_delay_ms": 0,
+    "health_check_period_ms": 500,
+    "health_check_timeout_ms": 2000,
+    "health_check_failure_threshold": 3,
+}
+"""Ray's own way takes half a minute to see that a machine is gone."""
+
+
+@pytest.fixture(scope="module")
+def machines() -> Iterator[Any]:
+    """A head and two nodes more, a processor each."""
+    made = cluster_utils.Cluster(
+        initialize_head=True,
+        head_node_args={**NODE, "include_dashboard": False, "_system_config": QUICK_TO_MISS},
+    )
+    try:
+        made.add_node(**NODE)
+        made.add_node(**NODE)
+        yield made
+    finally:
+        ray.shutdown()
+        made.shutdown()
+
+
+@pytest.fixture(scope="module")
+def connected(machines: Any) -> Iterator[Any]:
+    """The same, and this process is its driver."""
+    ray.init(address=machines.address, log_to_driver=False, logging_level="ERROR")
+    yield machines
+    ray.shutdown()
+
+
+@pytest.fixture
+def losing_a_node(connected: Any, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
+    """Work goes to the cluster in small shares, and a node is killed when the first comes back."""
+    if len(connected.worker_nodes) < 2:
+        connected.add_node(**NODE)
+    handed_back, lost = ray_tasks._handed_back, []
+
+    def lose_a_node(ended: Any) -> Any:
+        if not lost:
+            node = next(iter(connected.worker_nodes))
+            lost.append(node.unique_id)
+            connected.remove_node(node, allow_graceful=False)
+        return handed_back(ended)
+
+    monkeypatch.setattr(ray_tasks, "_handed_back", lose_a_node)
+    monkeypatch.setattr(ray_tasks, "TASK_SECONDS", 0.1)
+    monkeypatch.setattr(matching, "CHUNK_SECONDS", 0.1)
+    monkeypatch.setattr(matching, "FIRST_CHUNK", 4)
+    monkeypatch.setattr(blocks, "BLOCK", 4)
+    for module in (matching, blocks):
+        monkeypatch.setattr(module, "WORTH_A_PROCESS", 4)
+    with on_cluster(connected.address):
+        yield lost
+    assert lost, "no work went to the cluster"
+
+
+def tables(database: Path) -> dict[str, list[str]]:
+    """Every row of every table, in any order."""
+    with closing(sqlite3.connect(database)) as connection:
+        names = connection.execute(
+            "SELECT name FROM sqlite_master WHERE type = 'table' AND name NOT LIKE 'sqlite_%'"
+        )
+        return {
+            name: sorted(map(repr, connection.execute(f'SELECT * FROM "{name}"')))
+            for (name,) in names.fetchall()
+        }
+
+
+def here(work: Callable[[], Any]) -> Any:
+    """Do some work on this machine."""
+    with workers.using(workers.HERE):
+        return work()
+
+
+def some_pairs(database: Path, images: int = 9) -> list[tuple[str, str]]:
+    names = image_names(database)[:images]
+    return [(a, b) for i, a in enumerate(names) for b in names[i + 1 :]]
+
+
+# Equal to one machine, though a node is lost in every stage
+
+
+@pytest.mark.parametrize("camera", ["auto", "per-image"])
+def test_features(
+    camera: str, losing_a_node: list[str], flight: RenderedFlight, tmp_path: Path
+) -> None:
+    options = FeatureOptions(camera, max_features=300)
+    one, many = tmp_path / "one.db", tmp_path / "many.db"
+    report = extract_features(flight.images, many, options)
+    assert report == here(lambda: extract_features(flight.images, one, options))
+    assert tables(one) == tables(many)
+    again = extract_features(flight.images, many, options)
+    assert (again.already, again.extracted) == (12, 0)
+
+
+def test_descriptors_and_ranking(
+    losing_a_node: list[str], project_copy: MakeProject, tiny_checkpoint: Path
+) -> None:
+    options = RetrievalOptions(k=5, batch_size=1)
+    one, many = project_copy(name="one"), project_copy(name="many")
+    ranking = rank_project(many, str(tiny_checkpoint), options)
+    wanted = here(lambda: rank_project(one, str(tiny_checkpoint), options))
+    assert np.array_equal(ranking.partners, wanted.partners)
+    assert np.array_equal(ranking.scores, wanted.scores)
+    assert ranking.left_out == wanted.left_out == ()
+    with Store(many.cache) as store:
+        assert len(store.photos()) == 12
+
+
+@pytest.mark.parametrize("matcher", ["colmap", "guided"])
+def test_matches(matcher: str, losing_a_node: list[str], project_copy: MakeProject) -> None:
+    one, many = (project_copy(name=name).database for name in ("one", "many"))
+    report = match_pairs(many, some_pairs(many), MatchOptions(matcher))
+    alone = MatchOptions(matcher, processes=1)
+    wanted = here(lambda: match_pairs(one, some_pairs(one), alone))
+    assert (report.matched, report.verified) == (wanted.matched, wanted.verified)
+    assert tables(one) == tables(many)
+
+
+def test_clusters(losing_a_node: list[str], matched_database: Path, tmp_path: Path) -> None:
+    options = MappingOptions(cluster_size=3, threads=1)
+    clusters = partition(read_view_graph(matched_database), 3)
+    assert len(clusters) >= 3
+    models = {}
+    for name, run in (("many", lambda do: do()), ("one", here)):
+        state = tmp_path / name
+        state.mkdir()
+        report = run(
+            lambda state=state: parallel.map_clusters(matched_database, clusters, state, options)
+        )
+        assert [cluster.fault for cluster in report.clusters] == [None] * len(clusters)
+        assert report.peak_bytes > 0
+        models[name] = [
+            pycolmap.Reconstruction(path).summary() for path in sorted(state.glob("*/[0-9]"))
+        ]
+    assert models["many"] == models["one"] and len(models["one"]) >= len(clusters)
+
+
+# The command line
+
+
+def run(*arguments: object) -> Result:
+    return CliRunner().invoke(cli, [str(argument) for argument in arguments])
+
+
+def test_every_command_that_takes_a_cluster_takes_it(
+    connected: Any, flight: RenderedFlight, tiny_checkpoint: Path, tmp_path: Path
+) -> None:
+    database, where = tmp_path / "project.db", ("--cluster", connected.address)
+    for arguments in (
+        ("features", "--images", flight.images, "--max-features", 1000),
+        ("pairs", "--model", tiny_checkpoint, "--k", 4),
+        ("match",),
+        ("reconstruct", "--mapper", "parallel", "--cluster-size", 12),
+        ("compare", "--methods", "vlad", "--k", 3, "--no-reconstruct"),
+    ):
+        result = run(*arguments, "--db", database, *where)
+        assert result.exit_code == 0, result.output
+    assert pycolmap.Reconstruction(tmp_path / "sparse" / "0").num_reg_images() == 12
+
+
+# Stopped and gone on
+
+
+SLOW = """
+import sys, time
+from pathlib import Path
+from colmap_netvlad.cli import main
+from colmap_netvlad.matching import colmap as matching
+from colmap_netvlad.runtime import ray_tasks
+
+match_chunk = matching._match_chunk
+
+def slowly(seed, database, pairs):
+    time.sleep(0.5)
+    return match_chunk(seed, database, pairs)
+
+if __name__ == "__main__":
+    matching._match_chunk = slowly
+    matching.WORTH_A_PROCESS = matching.FIRST_CHUNK = 2
+    matching.CHUNK_SECONDS = ray_tasks.TASK_SECONDS = 0.01
+    main()
+"""
+
+
+@pytest.mark.parametrize("stop", [signal.SIGKILL, signal.SIGINT])
+def test_a_stopped_driver_goes_on_where_it_was(
+    stop: signal.Signals, machines: Any, project_copy: MakeProject, tmp_path: Path
+) -> None:
+    project, script = project_copy(), tmp_path / "slow.py"
+    pairs = some_pairs(project.database)
+    project.pairs.write_text("".join(f"{a} {b}\n" for a, b in pairs))
+    script.write_text(SLOW)
+    arguments = ["match", "--db", project.database, "--cluster", machines.address]
+    path = os.pathsep.join([str(Path(__file__).parents[1]), *sys.path])
+    driver = subprocess.Popen(
+        [sys.executable, script, *arguments],
+        env={**os.environ, "PYTHONPATH": path},
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    while not matched(project.database):
+        assert driver.poll() is None, driver.stderr.read()
+        time.sleep(0.05)
+    driver.send_signal(stop)
+    start = time.monotonic()
+    _, said = driver.communicate()
+    if stop is signal.SIGINT:
+        assert said.strip() == "Aborted!" and driver.returncode == 1
+        assert time.monotonic() - start < 2
+    before = matched(project.database)
+    assert 0 < before < len(pairs)
+    report = match_pairs(project.database, pairs)
+    assert (report.already, report.matched) == (before, len(pairs) - before)
+    other = project_copy(name="other").database
+    match_pairs(other, pairs)
+    assert tables(other) == tables(project.database)
+
+
+def matched(database: Path) -> int:
+    with open_database(database) as colmap:
+        return len(colmap.matched_pairs())
+
+
+# What is said in a sentence
+
+
+def connect(address: str) -> None:
+    with on_cluster(address):
+        raise AssertionError("connected")
+
+
+def test_an_address_where_nobody_listens(project_copy: MakeProject) -> None:
+    with closing(socket.socket()) as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{free.getsockname()[1]}"
+    start = time.monotonic()
+    result = run("pairs", "--db", project_copy().database, "--cluster", address)
+    assert time.monotonic() - start < 5
+    assert result.exit_code == 1
+    (line,) = result.output.splitlines()
+    assert f"No Ray cluster listens at {address}" in line and "mend --cluster" in line
+
+
+@pytest.mark.parametrize("address", ["cluster", "ray://10.0.0.1:10001", "10.0.0.1:port"])
+def test_what_is_no_address(address: str) -> None:
+    with pytest.raises(InputError, match="it is auto, or HOST:PORT"):
+        connect(address)
+
+
+def test_ray_is_not_installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(InputError, match=r"pip install \"colmap-netvlad\[cluster\]\""):
+        connect("auto")
+
+
+def test_a_machine_with_another_version(connected: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cluster, "VERSION", "9.9")
+    with pytest.raises(InputError, match=r"The machine \S+ \(.*\) .* this one 9\.9 with"):
+        connect(connected.address)
+
+
+def test_a_machine_without_the_package(connected: Any, tmp_path: Path) -> None:
+    hidden = 'import sys; sys.modules["colmap_netvlad"] = None'
+    (tmp_path / "sitecustomize.py").write_text(hidden)
+    node = connected.add_node(**NODE, env_vars={"PYTHONPATH": str(tmp_path)})
+    try:
+        with pytest.raises(InputError, match="lacks colmap-netvlad"):
+            connect(connected.address)
+    finally:
+        connected.remove_node(node, allow_graceful=False)
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="needs Linux's /proc")
+def test_a_photo_folder_that_a_machine_does_not_see(
+    connected: Any, flight: RenderedFlight, tmp_path: Path
+) -> None:
+    folder = os.open(flight.images, os.O_RDONLY)
+    mine = Path(f"/proc/self/fd/{folder}")  # a folder of this process alone
+    try:
+        with (
+            on_cluster(connected.address),
+            pytest.raises(InputError, match=f"The machine .* does not see {mine}"),
+        ):
+            extract_features(mine, tmp_path / "project.db", FeatureOptions(max_features=300))
+    finally:
+        os.close(folder)
+
+
+def take_nothing(database: Path, arguments: Sequence[Any], target: Path) -> None:
+    target.touch()
+
+
+def crash_or_write(
+    advance: Callable[[int], None], database: Path, folder: Path, crash: bool
+) -> None:
+    if crash:
+        os._exit(1)
+    (folder / "inner").mkdir()
+    (folder / "inner" / "done").write_text(database.name)
+    advance(2)
+
+
+def test_a_job_that_crashes_loses_itself_only(
+    connected: Any, matched_database: Path, tmp_path: Path
+) -> None:
+    jobs = [
+        Job(crash_or_write, (crash,), Source(matched_database, take_nothing), tmp_path / f"{crash}")
+        for crash in (True, False)
+    ]
+    ray.cloudpickle.register_pickle_by_value(sys.modules[__name__])  # nodes do not see the tests
+    done: list[int] = []
+    with on_cluster(connected.address):
+        outcomes = workers.run(jobs, 2, done.append)
+    assert "was lost 4 times" in (outcomes[0].fault or "") and outcomes[1].fault is None
+    assert (tmp_path / "False" / "inner" / "done").read_text() == "part.db"
+    assert done == [2]
