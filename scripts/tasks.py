@@ -76,7 +76,8 @@ def test(arguments: list[str]) -> int:
     run(python, "-m", "ruff", "check", ".")
     run(python, "-m", "ruff", "format", "--check", ".")
     run(python, "-m", "mypy")
-    return run(python, "-m", "pytest", "-q", "-n", "2", *arguments)
+    # Groups stay in one process: those of a cluster share it.
+    return run(python, "-m", "pytest", "-q", "-n", "2", "--dist", "loadgroup", *arguments)
 
 
 def lowest(arguments: list[str]) -> int:

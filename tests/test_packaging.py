@@ -81,7 +81,7 @@ def test_the_version_stands_in_one_place_and_its_copy() -> None:
 def test_the_dependencies_are_what_is_imported() -> None:
     package = Path(colmap_netvlad.__file__).parent
     foreign = imported(package) - set(sys.stdlib_module_names) - {"colmap_netvlad"}
-    assert {canonicalize_name(MODULES.get(name, name)) for name in foreign} == set(requirements())
+    assert {canonicalize_name(MODULES.get(name, name)) for name in foreign} == set(requirements("cluster"))
 
 
 def test_the_lowest_versions_are_the_bounds() -> None:
@@ -96,7 +96,7 @@ def test_the_lowest_versions_are_the_bounds() -> None:
 
 def test_the_tested_versions_pin_every_dependency_within_its_bounds() -> None:
     tested = pins("constraints.txt")
-    for name, requirement in requirements("fit", "test", "dev").items():
+    for name, requirement in requirements("cluster", "fit", "test", "dev").items():
         assert name in tested, f"constraints.txt does not pin {name}"
         assert requirement.specifier.contains(tested[name]), f"{requirement} against {tested[name]}"
 
