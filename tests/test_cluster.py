@@ -8,6 +8,7 @@ import socket
 import sqlite3
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
@@ -293,6 +294,15 @@ def test_an_address_where_nobody_listens(project_copy: MakeProject) -> None:
     assert result.exit_code == 1
     (line,) = result.output.splitlines()
     assert f"No Ray cluster listens at {address}" in line and "mend --cluster" in line
+
+
+def test_an_address_where_something_else_listens() -> None:
+    with closing(socket.create_server(("127.0.0.1", 0))) as other:
+        threading.Thread(
+            target=lambda: other.accept()[0].send(b"HTTP/1.1 505"), daemon=True
+        ).start()
+        with pytest.raises(InputError, match="No Ray cluster listens"):
+            connect(f"127.0.0.1:{other.getsockname()[1]}")
 
 
 @pytest.mark.parametrize("address", ["cluster", "ray://10.0.0.1:10001", "10.0.0.1:port"])

@@ -81,7 +81,9 @@ def test_the_version_stands_in_one_place_and_its_copy() -> None:
 def test_the_dependencies_are_what_is_imported() -> None:
     package = Path(colmap_netvlad.__file__).parent
     foreign = imported(package) - set(sys.stdlib_module_names) - {"colmap_netvlad"}
-    assert {canonicalize_name(MODULES.get(name, name)) for name in foreign} == set(requirements("cluster"))
+    assert {canonicalize_name(MODULES.get(name, name)) for name in foreign} == set(
+        requirements("cluster")
+    )
 
 
 def test_the_lowest_versions_are_the_bounds() -> None:

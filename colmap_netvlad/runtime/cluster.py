@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import logging
+import os
 import signal
 import socket
 from collections.abc import Iterator
@@ -16,6 +17,11 @@ from colmap_netvlad.runtime.version import VERSION
 
 LISTEN_SECONDS = 3.0
 """How long a machine may take to say that it listens."""
+
+SETTINGS = b"\x04"
+GREETING = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + b"\0\0\0" + SETTINGS + b"\0\0\0\0\0"
+"""How HTTP/2, which Ray's head speaks, begins (RFC 9113, 3.4); the answer is a frame of settings
+too. Ray itself asks whoever else listens for minutes."""
 
 ANSWER_SECONDS = 60.0
 """How long a machine may take to start a process and answer."""
@@ -92,12 +98,17 @@ def _check_address(address: str) -> None:
             "(10.0.0.1:6379), on a machine of the cluster."
         )
     try:
-        socket.create_connection((host, int(port)), LISTEN_SECONDS).close()
-    except (OSError, OverflowError) as fault:
+        with socket.create_connection((host, int(port)), LISTEN_SECONDS) as connection:
+            connection.settimeout(LISTEN_SECONDS)
+            connection.sendall(GREETING)
+            answer = connection.recv(9)
+    except (OSError, OverflowError):
+        answer = b""
+    if answer[3:4] != SETTINGS and os.environ.get("RAY_USE_TLS") != "1":
         raise InputError(
             f"No Ray cluster listens at {address}; start it there with `ray start --head`, or mend "
             "`cluster`."
-        ) from fault
+        )
 
 
 def _check_machines(ray: Any) -> None:
