@@ -1,19 +1,21 @@
-"""Ray on one machine beside its own processes, stage by stage, and how much a driver can serve.
+"""Ray on one machine beside its own processes, and how many machines a driver can serve.
 
-    python benchmarks/cluster.py PHOTOS [--most 40] [--k 10] [--max-features 8192]
+    python benchmarks/cluster.py stages PHOTOS [--most 40] [--k 10] [--cluster-size 15]
+    python benchmarks/cluster.py driver DATABASE:PHOTOS [--images 100] [--pairs 200] [--pairs 1000]
 
-Each stage runs on this machine's processes and as tasks of a Ray cluster that is this machine, in
-turn, on copies of the same database: wall, and CPU seconds of all processes together (looked at
-five times a second; Linux only). What Ray's own daemons take is in it, starting the cluster is not.
+`stages` runs each stage on this machine's processes and then as tasks of a Ray cluster that is
+this machine: wall, and CPU seconds of all processes together (looked at five times a second; Linux
+only). What Ray's own daemons take is in it, starting the cluster is not.
 
-The driver's limit is its own CPU time on the cluster: units (photos, pairs) a second that one
-processor's driver can send and take back. Processors at work per unit over the driver's tell how
-many processors it keeps busy.
+`driver` takes the driver's part of a task alone, for shares as large as 30 seconds of work are:
+making the part of the database, handing it to Ray, taking a result from Ray, writing it. CPU
+seconds of this process, whose threads carry Ray's data too. The results are real ones.
 """
 
 from __future__ import annotations
 
 import os
+import pickle
 import shutil
 import sqlite3
 import tempfile
@@ -22,30 +24,43 @@ import time
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import click
+import ray
 from ray.cluster_utils import Cluster
 from rich.console import Console
 from rich.table import Table
 
-from colmap_netvlad.colmap.database import image_names
+from colmap_netvlad.cache.store import Store
+from colmap_netvlad.colmap.copies import FEATURES, read_rows, write_rows
+from colmap_netvlad.colmap.database import image_names, open_database
 from colmap_netvlad.colmap.features import FeatureOptions, extract_features
+from colmap_netvlad.colmap.parts import PartsOfImport, part_of_pairs, rows_of_pairs
+from colmap_netvlad.colmap.results import write_results
 from colmap_netvlad.flight import open_flight
 from colmap_netvlad.graph.viewgraph import read_view_graph
 from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.mapping.parallel import map_clusters
 from colmap_netvlad.mapping.partition import partition
+from colmap_netvlad.matching.blocks import Photos, match_block
 from colmap_netvlad.matching.options import MatchOptions
-from colmap_netvlad.matching.run import match_pairs
-from colmap_netvlad.models.catalogue import DEFAULT
+from colmap_netvlad.matching.run import in_tiles, match_pairs
+from colmap_netvlad.models.catalogue import CATALOGUE, DEFAULT
 from colmap_netvlad.models.checkpoint import load_model
 from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval.methods import deep
+from colmap_netvlad.retrieval.methods.deep import _describe_share
 from colmap_netvlad.retrieval.options import RetrievalOptions
 from colmap_netvlad.runtime.cluster import on_cluster
+from colmap_netvlad.runtime.jobs import Enclosed
 from colmap_netvlad.runtime.machine import usable_processors
-from colmap_netvlad.terminal import Command
+from colmap_netvlad.runtime.ray_tasks import Call, _part
+from colmap_netvlad.terminal import Group
+
+REPEATS = 3
 
 LOOK_SECONDS = 0.2
 TICK = os.sysconf("SC_CLK_TCK")
@@ -53,11 +68,10 @@ TICK = os.sysconf("SC_CLK_TCK")
 
 @dataclass
 class Cost:
-    """What a stage took, s: wall, CPU of all processes, and of this one alone."""
+    """What a stage took, s: wall, and CPU of all processes."""
 
     wall: float
     cpu: float
-    driver: float
 
 
 class Family:
@@ -96,9 +110,9 @@ class Family:
 
 
 def measured(family: Family, stage: Callable[[], object]) -> Cost:
-    wall, cpu, driver = time.monotonic(), family.seconds(), time.process_time()
+    wall, cpu = time.monotonic(), family.seconds()
     stage()
-    return Cost(time.monotonic() - wall, family.seconds() - cpu, time.process_time() - driver)
+    return Cost(time.monotonic() - wall, family.seconds() - cpu)
 
 
 def without_matches(source: Path, target: Path) -> Path:
@@ -114,14 +128,19 @@ def describe(project: Project) -> None:
         deep.describe_photos(flight, RetrievalOptions(), DEFAULT)
 
 
-@click.command(cls=Command)
+@click.group(cls=Group)
+def cli() -> None:
+    """Measure Ray."""
+
+
+@cli.command()
 @click.argument("photos", type=click.Path(path_type=Path, exists=True, file_okay=False))
 @click.option("--most", default=40, show_default=True, help="Photos at most.")
 @click.option("--k", default=10, show_default=True, help="Neighbours by name that are matched.")
 @click.option("--max-features", default=8192, show_default=True)
 @click.option("--cluster-size", default=15, show_default=True)
-def main(photos: Path, most: int, k: int, max_features: int, cluster_size: int) -> None:
-    """Run every stage both ways and print two tables."""
+def stages(photos: Path, most: int, k: int, max_features: int, cluster_size: int) -> None:
+    """Run every stage both ways and print a table."""
     load_model(DEFAULT)  # what it imports is no stage's cost
     family = Family()
     costs: dict[str, tuple[int, str, dict[str, Cost]]] = {}
@@ -141,7 +160,7 @@ def main(photos: Path, most: int, k: int, max_features: int, cluster_size: int) 
             def note(stage: str, units: int, unit: str, work: Callable[[], object]) -> None:
                 cost = measured(family, work)
                 costs.setdefault(stage, (units, unit, {}))[2][side] = cost
-                print(f"{side:7} {stage:20} {cost.wall:7.1f} s, CPU {cost.cpu:7.1f}", flush=True)
+                print(f"{side}, {stage}, {units:,} {unit}s: {cost}", flush=True)
 
             count = len(list(images.iterdir()))
             note("features", count, "photo", lambda: extract_features(images, database, options))
@@ -182,25 +201,14 @@ def main(photos: Path, most: int, k: int, max_features: int, cluster_size: int) 
     overhead = Table(
         "stage", "units", "local wall s", "Ray wall s", "ratio", "local CPU s", "Ray CPU s", "ratio"
     )
-    limit = Table(
-        "stage", "driver ms a unit", "units a second", "work ms a unit", "processors kept busy"
-    )
-    total: dict[str, Cost] = {side: Cost(0, 0, 0) for side in ("local", "Ray")}
+    total: dict[str, Cost] = {side: Cost(0, 0) for side in ("local", "Ray")}
     for stage, (units, unit, sides) in costs.items():
         for side, cost in sides.items():
             total[side].wall += cost.wall
             total[side].cpu += cost.cpu
         overhead.add_row(stage, f"{units:,} {unit}s", *ratio(sides))
-        driver = sides["Ray"].driver / units
-        work = (sides["Ray"].cpu - sides["Ray"].driver) / units
-        limit.add_row(
-            stage, f"{1000 * driver:.2f}", f"{1 / driver:,.0f} {unit}s", f"{1000 * work:.0f}",
-            f"{work / driver:,.0f}",
-        )  # fmt: skip
     overhead.add_row("all", "", *ratio(total))
-    console = Console(width=160)
-    console.print(overhead)
-    console.print(limit)
+    Console(width=160).print(overhead)
 
 
 def ratio(sides: dict[str, Cost]) -> list[str]:
@@ -211,5 +219,74 @@ def ratio(sides: dict[str, Cost]) -> list[str]:
     ]  # fmt: skip
 
 
+@cli.command()
+@click.argument("scene", metavar="DATABASE:PHOTOS")
+@click.option("--images", default=100, show_default=True, help="Photos at most.")
+@click.option("--pairs", multiple=True, default=(200, 1000), show_default=True, help="Of a share.")
+def driver(scene: str, images: int, pairs: tuple[int, ...]) -> None:
+    """Print what one item of each stage costs the driver."""
+    database, _, photos = scene.partition(":")
+    table = Table(
+        "stage", "items of a share", "MiB there", "MiB back", "driver ms an item", "items/s"
+    )
+    ray.init(num_cpus=1, include_dashboard=False, log_to_driver=False)
+    with tempfile.TemporaryDirectory() as scratch:
+        source = without_matches(Path(database), Path(scratch, "project.db"))
+        names = image_names(source)[:images]
+        with open_database(source) as colmap:
+            ids = [row.image_id for row in colmap.images()][:images]
+        near = in_tiles([(a, b) for i, a in enumerate(ids) for b in ids[i + 1 : i + 21]])
+
+        def row(
+            stage: str,
+            count: int,
+            there: Callable[[], bytes],
+            back: object,
+            keep: Callable[[Any], None],
+        ) -> None:
+            result = ray.put(back)
+            sent = there()
+            start = time.process_time()
+            for _ in range(REPEATS):
+                held = ray.put(there())
+                keep(ray.get(result))
+                del held
+            each = (time.process_time() - start) / REPEATS / count
+            sizes = [f"{len(data) / 2**20:.1f}" for data in (sent, pickle.dumps(back))]
+            table.add_row(stage, f"{count:,}", *sizes, f"{1000 * each:.2f}", f"{1 / each:,.0f}")
+
+        for count in pairs:
+            share = near[:count]
+            part = partial(_part, Call(share, partial(part_of_pairs, source, share)))
+            report = match_block(Photos(), source, MatchOptions("guided"), share)
+            row("match, guided", len(share), part, report.results, partial(write_results, source))
+            row(
+                "match, colmap",
+                len(share),
+                part,
+                rows_of_pairs(source, share),
+                partial(write_rows, source),
+            )
+        parts = PartsOfImport(source, names)
+        part = partial(_part, Call(names, partial(parts.part, source, names)))
+        features = read_rows(source, dict.fromkeys(FEATURES, ("image_id", ids)))
+        row("features", len(names), part, features, partial(write_rows, source))
+        described = list(
+            _describe_share(
+                Enclosed(CATALOGUE[DEFAULT].file()), Path(photos), RetrievalOptions(), names
+            )
+        )
+        with Store(Path(scratch, "cache.db")) as store:
+
+            def keep(batches: list[Any]) -> None:
+                for batch in batches:
+                    store.add_descriptors(
+                        "model", batch.names, batch.names, batch.vectors, 1.0, batch.cells
+                    )
+
+            row("describe", len(names), lambda: b"", described, keep)
+    Console(width=160).print(table)
+
+
 if __name__ == "__main__":
-    main()
+    cli()

@@ -39,7 +39,7 @@ from colmap_netvlad.retrieval.rank import rank_project
 from colmap_netvlad.runtime import cluster, workers
 from colmap_netvlad.runtime.cluster import on_cluster
 from colmap_netvlad.runtime.errors import InputError
-from colmap_netvlad.runtime.jobs import Job, Source
+from colmap_netvlad.runtime.jobs import Capacity, Job, Load, Source
 
 ray = pytest.importorskip("ray", reason="Ray is not installed: pip install colmap-netvlad[cluster]")
 ray_tasks = pytest.importorskip("colmap_netvlad.runtime.ray_tasks")
@@ -274,6 +274,31 @@ def test_a_stopped_driver_goes_on_where_it_was(
 def matched(database: Path) -> int:
     with open_database(database) as colmap:
         return len(colmap.matched_pairs())
+
+
+# What a task asks of its machine
+
+
+MACHINES = [
+    {"CPU": 16.0, "memory": 64e9},
+    {"CPU": 8.0, "memory": 16e9, "GPU": 2.0},
+    {"memory": 16e9},
+]
+
+
+def test_tasks_fit_on_some_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ray_tasks, "_machines", lambda: MACHINES)
+    assert ray_tasks.RayTasks().capacity() == Capacity(24, 96e9, 16)
+    for load, fitting, slots in (
+        (Load(), Load(), 24),
+        (Load(memory=8e9), Load(memory=8e9), 10),
+        (Load(32, 1e12), Load(16, 64e9), 1),
+        (Load(gpu=True), Load(4, gpu=True), 2),  # each GPU's share of processors decodes
+    ):
+        assert ray_tasks._fitting(load) == fitting
+        assert ray_tasks._slots(fitting) == slots
+    monkeypatch.setattr(ray_tasks, "_machines", lambda: MACHINES[:1])
+    assert ray_tasks._fitting(Load(gpu=True)) == Load(), "no machine has a GPU"
 
 
 # What is said in a sentence

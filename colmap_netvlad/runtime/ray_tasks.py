@@ -12,7 +12,7 @@ parts of the database that they carry would fill this machine's object store.
 from __future__ import annotations
 
 import contextlib
-import logging
+import math
 import socket
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
@@ -40,8 +40,6 @@ from colmap_netvlad.runtime.jobs import (
 )
 from colmap_netvlad.runtime.processes import peak_bytes
 from colmap_netvlad.runtime.version import VERSION
-
-logger = logging.getLogger(__name__)
 
 TASK_SECONDS = 30.0
 """How long a task should take: long beside Ray's milliseconds, short beside a machine's life."""
@@ -169,7 +167,7 @@ class RayTasks:
             return outcomes
         calls = (_call_of(number, job) for number, job in enumerate(jobs))
         order = Order(_do_job, initialiser, None, _fitting(jobs[0].load))
-        with contextlib.closing(_tasks(order, calls)) as tasks:
+        with contextlib.closing(_tasks(order, calls, workers)) as tasks:
             for call, done in tasks:
                 (number, *_) = call.share[0]
                 if isinstance(done, Exception):
@@ -195,9 +193,10 @@ def _call_of(number: int, job: Job) -> Call:
 
 
 def _tasks(
-    order: Order, calls: Iterator[Call]
+    order: Order, calls: Iterator[Call], most: float = math.inf
 ) -> Generator[tuple[Call, Done | Exception], None, None]:
-    """Yield calls and what they handed back, or why they failed, as they end."""
+    """Yield calls and what they handed back, or why they failed, as they end; at most `most` are
+    under way."""
     load = order.load
     task = ray.remote(
         num_cpus=load.processors,
@@ -216,7 +215,7 @@ def _tasks(
         while waiting is not None or running:
             while (
                 waiting is not None
-                and len(running) < max(1, AHEAD * slots)
+                and len(running) < min(most, max(1, AHEAD * slots))
                 and (sum(size for *_, size in running.values()) < store or not running)
             ):
                 part = _part(waiting)
