@@ -41,6 +41,7 @@ from colmap_netvlad.runtime.cluster import on_cluster
 from colmap_netvlad.runtime.errors import InputError
 from colmap_netvlad.runtime.jobs import Capacity, Job, Load, Source
 
+os.environ["RAY_AUTH_MODE"] = "disabled"  # else Ray keeps a token in the home folder
 ray = pytest.importorskip("ray", reason="Ray is not installed: pip install colmap-netvlad[cluster]")
 ray_tasks = pytest.importorskip("colmap_netvlad.runtime.ray_tasks")
 cluster_utils = pytest.importorskip("ray.cluster_utils")

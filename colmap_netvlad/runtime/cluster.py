@@ -69,9 +69,10 @@ def _connect(ray: Any, address: str) -> None:
     try:
         ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
     except ConnectionError as fault:
+        where = "in no Ray cluster" if address == "auto" else f"not in the Ray cluster at {address}"
         raise InputError(
-            "This machine is in no Ray cluster; start one with `ray start --head`, or join one "
-            "with `ray start --address HOST:PORT`."
+            f"This machine is {where}, or has another token (~/.ray/auth_token) than it; start "
+            "one with `ray start --head`, or join one with `ray start --address HOST:PORT`."
         ) from fault
     except Exception as fault:
         lines = str(fault).strip().splitlines()
