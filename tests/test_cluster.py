@@ -48,12 +48,15 @@ cluster_utils = pytest.importorskip("ray.cluster_utils")
 pytestmark = pytest.mark.xdist_group("ray")
 
 MakeProject = Callable[..., Project]
+LEAVE_SECONDS = 5.0
+"""Ctrl-C takes less than 2 s; a busy machine has some more."""
+
 NODE = {"num_cpus": 1, "object_store_memory": 80 * 2**20}
 QUICK_TO_MISS = {
     "health_check_initial_delay_ms": 0,
     "health_check_period_ms": 500,
-    "health_check_timeout_ms": 2000,
-    "health_check_failure_threshold": 3,
+    "health_check_timeout_ms": 10_000,  # one that is only slow is not
+    "health_check_failure_threshold": 5,
 }
 """Ray's own way takes half a minute to see that a machine is gone."""
 
@@ -261,7 +264,7 @@ def test_a_stopped_driver_goes_on_where_it_was(
     _, said = driver.communicate()
     if stop is signal.SIGINT:
         assert said.strip() == "Aborted!" and driver.returncode == 1
-        assert time.monotonic() - start < 2
+        assert time.monotonic() - start < LEAVE_SECONDS
     before = matched(project.database)
     assert 0 < before < len(pairs)
     report = match_pairs(project.database, pairs)
