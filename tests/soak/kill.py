@@ -64,34 +64,39 @@ class Kind:
     makes: str = ""
 
 
-def photos(folder: Path, seed: int = 0) -> None:
-    """Eight rendered photos."""
+def photos(folder: Path, seed: int = 0, rows: int = 2) -> None:
+    """Eight rendered photos: two rows of four."""
     from colmap_netvlad.demo.render import FlightOptions, render_flight
 
-    options = FlightOptions(rows=2, columns=4, width=400, height=300, altitude=45.0, seed=seed)
+    options = FlightOptions(rows=rows, columns=4, width=400, height=300, altitude=45.0, seed=seed)
     render_flight(folder / "flight", options)
     (folder / "flight" / "images").rename(folder / "images")
     shutil.rmtree(folder / "flight")
 
 
-def features(folder: Path) -> None:
+def features(folder: Path, rows: int = 2) -> None:
     """The same with features."""
-    photos(folder)
+    photos(folder, rows=rows)
     run(folder, "features", "--images", "{}/images", "--db", "{}/project.db", *FEW)
 
 
-def listed(folder: Path) -> None:
+def listed(folder: Path, rows: int = 2) -> None:
     """The same with a list of all pairs."""
-    features(folder)
+    features(folder, rows)
     names = sorted(path.name for path in (folder / "images").iterdir())
     pairs = [f"{a} {b}\n" for a in names for b in names if a < b]
     (folder / "pairs.txt").write_text("".join(pairs))
 
 
-def matched(folder: Path) -> None:
+def matched(folder: Path, rows: int = 2) -> None:
     """The same, matched."""
-    listed(folder)
+    listed(folder, rows)
     run(folder, "match", "--db", "{}/project.db")
+
+
+def larger(folder: Path) -> None:
+    """Twelve photos, matched: models of fewer than ten are not merged."""
+    matched(folder, rows=3)
 
 
 def built(folder: Path) -> None:
@@ -123,7 +128,7 @@ def annotated(folder: Path) -> None:
 
 FEW = ("--max-features", "800", "--threads", "1")
 ONE = ("--mapper", "incremental", "--threads", "1")
-CLUSTERS = ("--mapper", "parallel", "--cluster-size", "5", "--threads", "1")
+CLUSTERS = ("--mapper", "parallel", "--cluster-size", "6", "--threads", "1")
 DB = ("--db", "{}/project.db")
 
 KINDS = {
@@ -133,7 +138,7 @@ KINDS = {
     "match": Kind(("match", *DB), listed),
     "match-rounds": Kind(("match", *DB, "--rounds", "2", "--k", "2", "--method", "vlad"), features),
     "reconstruct": Kind(("reconstruct", *DB, *ONE), matched, "sparse/0"),
-    "reconstruct-parallel": Kind(("reconstruct", *DB, *CLUSTERS), matched, "sparse/0"),
+    "reconstruct-parallel": Kind(("reconstruct", *DB, *CLUSTERS), larger, "sparse/0"),
     "add": Kind(
         ("add", *DB, "--images", "{}/images", "--method", "vlad", "--k", "5"), built, "sparse-2/0"
     ),
