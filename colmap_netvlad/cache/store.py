@@ -45,6 +45,10 @@ ORPHANS_SETTING = "orphans"
 IMAGES_SETTING = "images"
 """The photo folder: absolute, or relative to the cache where it lies below it."""
 
+PLACE_SETTING = "place"
+"""Where the cache was when it was told an absolute photo folder: copied to another project, it says
+nothing of that one's photos."""
+
 
 @dataclass(frozen=True)
 class SeenPhoto:
@@ -300,6 +304,7 @@ class Store:
         folder, base = folder.resolve(), self.path.parent.resolve()
         inside = folder.is_relative_to(base)
         self.remember(IMAGES_SETTING, os.path.relpath(folder, base) if inside else str(folder))
+        self.remember(PLACE_SETTING, str(base))
 
     def _open(self) -> None:
         application, tables, version = self._header()
@@ -442,8 +447,11 @@ def remembered_images(cache: Path) -> Path | None:
     if not cache.is_file():
         return None
     with Store(cache) as store:
-        folder = store.setting(IMAGES_SETTING)
-    return None if folder is None else cache.parent / folder
+        folder, place = store.setting(IMAGES_SETTING), store.setting(PLACE_SETTING)
+    if folder is None:
+        return None
+    moved = place is not None and place != str(cache.parent.resolve())
+    return None if moved and Path(folder).is_absolute() else cache.parent / folder
 
 
 def _text_or_none(value: object) -> str | None:

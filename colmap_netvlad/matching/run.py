@@ -16,6 +16,7 @@ from colmap_netvlad.colmap.database import open_database
 from colmap_netvlad.graph.pair import IdPair
 from colmap_netvlad.matching.matchers import usable_matcher
 from colmap_netvlad.matching.options import MatchOptions, MatchReport, Work
+from colmap_netvlad.matching.stale import check_same_features
 from colmap_netvlad.runtime import progress
 from colmap_netvlad.runtime.errors import InputError
 
@@ -37,9 +38,9 @@ def match_pairs(
     needs Python's `if __name__ == "__main__":`, as the processes import it again.
 
     Raises:
-        InputError: an unknown image name, no features at all or damaged ones, an unknown matcher,
-            or a database that cannot be written; a process that failed: what was matched by then
-            stays.
+        InputError: an unknown image name, no features at all or damaged ones, matches of features
+            that are no longer there, an unknown matcher, or a database that cannot be written; a
+            process that failed: what was matched by then stays.
     """
     engine.check_writable(database)
     with open_database(database) as colmap:
@@ -47,6 +48,9 @@ def match_pairs(
         keypoints, descriptors = colmap.keypoint_counts(), colmap.descriptor_counts()
         done = colmap.matched_pairs()
         matcher, note = usable_matcher(options, colmap.has_sift())
+        check_same_features(
+            colmap, {_sorted_ids(ids[a], ids[b]) for a, b in pairs if {a, b} <= ids.keys()} & done
+        )
     unknown = sorted({name for pair in pairs for name in pair} - set(ids))
     if unknown:
         raise InputError(f"{database} has no image {unknown[0]}; make the pairs list again.")

@@ -51,10 +51,10 @@ def candidates(flight: Flight, options: RetrievalOptions, depth: int) -> Ranking
             "`colmap-netvlad features`."
         )
     start = time.perf_counter()
-    words, learned = _codebook(store, database, list(ids.values()), options.seed)
-    seconds_codebook = time.perf_counter() - start
-    model = "vlad-" + hashlib.sha256(words.tobytes()).hexdigest()
     features = {name: flight.features[image_id] for name, image_id in ids.items()}
+    words, learned = _codebook(store, database, ids, features, options.seed)
+    seconds_codebook = time.perf_counter() - start
+    model = _model(words)
     to_do = missing(store, model, features)
     _describe(store, database, model, words, ids, features, to_do)
     left_out = {name: NO_FEATURES for name in flight.names if name not in ids}
@@ -120,18 +120,26 @@ def sample_descriptors(
 
 
 def _codebook(
-    store: Store, database: Database, image_ids: list[int], seed: int
+    store: Store, database: Database, ids: dict[str, int], features: dict[str, str], seed: int
 ) -> tuple[NDArray[np.float32], bool]:
-    """Return the words, from the cache where the project has not outgrown them, and whether
-    they were learned now."""
+    """Return the words, from the cache where they are of this project's features and it has not
+    outgrown them, and whether they were learned now."""
     key = f"vlad-{WORDS}-seed-{seed}"
     kept = store.codebook(key)
-    fits = kept is not None and kept[0].shape[1] == SIFT_BYTES
-    if kept is not None and fits and kept[1] <= len(image_ids) <= OUTGROWN * kept[1]:
-        return kept[0], False
-    words = learn_words(database, image_ids, seed)
-    store.keep_codebook(key, words, len(image_ids))
+    if kept is not None and kept[0].shape[1] == SIFT_BYTES and kept[1] <= len(ids):
+        # The words of another project, or of features that were extracted again, describe none
+        # or few of these.
+        described = len(ids) - len(missing(store, _model(kept[0]), features))
+        if len(ids) <= OUTGROWN * min(described, kept[1]):
+            return kept[0], False
+    words = learn_words(database, list(ids.values()), seed)
+    store.keep_codebook(key, words, len(ids))
     return words, True
+
+
+def _model(words: NDArray[np.float32]) -> str:
+    """Return the key of the descriptors by these words."""
+    return "vlad-" + hashlib.sha256(words.tobytes()).hexdigest()
 
 
 def _describe(
