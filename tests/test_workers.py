@@ -3,7 +3,9 @@
 import logging
 import os
 import pickle
-from collections.abc import Callable, Iterator
+import signal
+import sys
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -11,7 +13,7 @@ import pycolmap
 import pytest
 
 from colmap_netvlad.colmap import engine
-from colmap_netvlad.runtime import workers
+from colmap_netvlad.runtime import processes, workers
 from colmap_netvlad.runtime.errors import InputError
 from colmap_netvlad.runtime.jobs import AHEAD, Enclosed, Job, Shares, Source
 
@@ -37,6 +39,14 @@ def vanish(advance: Callable[[int], None]) -> None:
     os.kill(os.getpid(), 9)
 
 
+def is_deaf(share: Sequence[int] = ()) -> bool:
+    return signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, [])
+
+
+def be_deaf(advance: Callable[[int], None]) -> None:
+    assert is_deaf()
+
+
 def test_faults_and_crashes_are_told_apart_and_lose_no_other_job() -> None:
     jobs = [
         Job(complain, ()),
@@ -60,6 +70,24 @@ def test_faults_and_crashes_are_told_apart_and_lose_no_other_job() -> None:
     assert sum(done) == 5
     assert ended == dict(enumerate(outcome.fault for outcome in outcomes))
     assert outcomes[4].peak_bytes > 0
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no signal masks")
+def test_a_worker_that_loads_is_not_interrupted_and_this_process_is() -> None:
+    """Ctrl-C reaches the whole group; a worker interrupted while it imports prints a traceback."""
+    (outcome,) = workers.run([Job(be_deaf, ())], 1, lambda count: None)
+    assert outcome.fault is None
+    assert list(workers.results(is_deaf, [1], 1)) == [True]
+    assert not is_deaf()
+    heard = []
+    before = signal.signal(signal.SIGTERM, lambda *arguments: heard.append("after"))
+    try:
+        with processes._heard_later():
+            os.kill(os.getpid(), signal.SIGTERM)
+            heard.append("in the block")
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert heard == ["in the block", "after"]
 
 
 def test_no_jobs_are_no_work() -> None:

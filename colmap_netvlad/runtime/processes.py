@@ -9,7 +9,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Generator, Iterable, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor
 from concurrent.futures import wait as wait_for_any
 from concurrent.futures.process import BrokenProcessPool
@@ -74,9 +74,10 @@ class Processes:
                         target=_work,
                         args=(jobs[number], counters[number], sender, initialiser),
                     )
-                    process.start()
+                    with _heard_later():
+                        process.start()
+                        running[number] = process, receiver
                     sender.close()
-                    running[number] = process, receiver
                 wait([process.sentinel for process, _ in running.values()], POLL_SECONDS)
                 done = sum(counter.value for counter in counters)
                 advance(done - told)
@@ -113,9 +114,10 @@ class Processes:
         running: dict[Future[tuple[float, Result]], int] = {}
         try:
             while shares or running:
-                while shares and len(running) < AHEAD * workers:
-                    share = shares.next(workers)
-                    running[pool.submit(_timed, called, share)] = len(share)
+                with _heard_later():  # the first share starts all processes
+                    while shares and len(running) < AHEAD * workers:
+                        share = shares.next(workers)
+                        running[pool.submit(_timed, called, share)] = len(share)
                 done, _ = wait_for_any(running, return_when=FIRST_COMPLETED)
                 for ended in sorted(done, key=lambda ended: ended.exception() is not None):
                     seconds, result = ended.result()
@@ -141,6 +143,27 @@ class Processes:
         """Work at all items in this process."""
         called = function if source is None else partial(function, source.path)
         yield from called(items)
+
+
+@contextlib.contextmanager
+def _heard_later() -> Iterator[None]:
+    """Let processes that are started in the block not be interrupted while they load: Ctrl-C
+    reaches the whole group, and half of what this one tells them is none. It hears of Ctrl-C and
+    SIGTERM at the end of the block."""
+    if sys.platform == "win32" or threading.current_thread() is not threading.main_thread():
+        yield  # Windows has no signal masks; only the main thread is interrupted
+        return
+    heard: list[int] = []
+    # They keep the mask, but not the handler: `terminate` ends them at any time.
+    kept = signal.signal(signal.SIGTERM, lambda number, frame: heard.append(number))
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, kept)
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        for number in heard:
+            signal.raise_signal(number)
 
 
 def _timed(function: Callable[..., Result], share: Sequence[Item]) -> tuple[float, Result]:
