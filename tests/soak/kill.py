@@ -365,7 +365,8 @@ def disturbed(
         if ended is not None:
             took.append(ended)
         if sent != signal.SIGKILL:
-            wrong += left_behind(folder)
+            # Finished clusters are kept for the next run.
+            wrong += [left for left in left_behind(folder) if not left.endswith(".clusters")]
             if ended is not None and ended > STOPS_WITHIN:
                 wrong.append(f"{sent.name} after {after:.2f} s: stopped within {ended:.2f} s")
         if ended is None or finished(kind, folder):
