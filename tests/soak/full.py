@@ -3,9 +3,9 @@
     python tests/soak/full.py pairs --times 30 --seed 0
 
 Each try puts a small project, or the temporary files of its commands, on a disk of its own (tmpfs:
-Linux, as root) with a random amount of room. Wanted is one sentence or success, nothing half
-written, and, with room again, the end of an undisturbed run. What COLMAP itself writes is guarded
-by 64 MiB that stay free; half of the tries have a little more than these.
+Linux, as root) with a random amount of room, up to twice what the command writes. Wanted is one
+sentence or success, nothing half written, and, with room again, the end of an undisturbed run. What
+COLMAP itself writes is guarded by 64 MiB that stay free; half of the tries have a little more.
 """
 
 from __future__ import annotations
@@ -23,14 +23,19 @@ import kill
 
 ROOM = 2**30
 GUARD = 64 * 2**20
-NEEDS = 12 * 2**20
-"""More than any command here writes."""
+LEAST = 256 * 2**10
+"""Room for the journals of small databases, bytes."""
 
 
 def resize(disk: Path, size: int) -> None:
     """Give a mounted tmpfs another size, bytes."""
     options = f"remount,size={size}"
     subprocess.run(["mount", "-o", options, str(disk)], check=True)
+
+
+def size(folder: Path) -> int:
+    """Return what the files of a folder hold, bytes."""
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
 
 
 def ended(folder: Path, words: tuple[str, ...]) -> tuple[int, str]:
@@ -61,6 +66,7 @@ def main() -> int:
         shutil.copytree(base, whole)
         kill.run(whole, *kind.words)
         wanted = kill.state(whole)
+        needs = LEAST + 2 * max(0, size(whole) - size(base))
         subprocess.run(["mount", "-t", "tmpfs", f"-osize={ROOM}", "tmpfs", str(disk)], check=True)
         try:
             for number, random in kill.tries(chosen):
@@ -76,7 +82,7 @@ def main() -> int:
                     shutil.copytree(base, folder)
                     (folder.parent / "scratch").symlink_to(small)
                 used = shutil.disk_usage(disk).used
-                room = int(random.uniform(0, NEEDS)) + GUARD * int(random.integers(2))
+                room = int(random.uniform(0, needs)) + GUARD * int(random.integers(2))
                 resize(disk, (used + room) // 4096 * 4096 + 4096)
                 wrong = []
                 try:
