@@ -5,8 +5,10 @@ Progress and notes go to standard error, so that standard output stays a clean r
 
 from __future__ import annotations
 
+import errno
 import logging
 import re
+import sqlite3
 import sys
 import time
 from collections.abc import Iterator
@@ -50,12 +52,26 @@ class Command(click.Command):
                 return super().invoke(ctx)
             except InputError as fault:
                 raise click.ClickException(as_options(fault.message, ctx)) from fault
+            except (OSError, sqlite3.OperationalError) as fault:
+                if not says_full(fault):
+                    raise
+                raise click.ClickException(
+                    f"A disk is full ({fault}); make room and run the command again: it goes on "
+                    "where it stopped."
+                ) from fault
 
 
 class Group(click.Group):
     """Commands of this kind."""
 
     command_class = Command
+
+
+def says_full(fault: OSError | sqlite3.OperationalError) -> bool:
+    """Whether a fault is that of a full disk: any write may meet one, of sqlite's too."""
+    if isinstance(fault, OSError):
+        return fault.errno in (errno.ENOSPC, errno.EDQUOT)
+    return fault.sqlite_errorcode == sqlite3.SQLITE_FULL
 
 
 def as_options(text: str, context: click.Context) -> str:

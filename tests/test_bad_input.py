@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import shutil
 import sqlite3
@@ -361,3 +362,31 @@ def test_ctrl_c_in_pairs_is_clean_and_the_next_run_completes(project_copy: MakeP
     assert not project.pairs.exists()
     assert content(project.folder).items() >= before.items()
     assert run(*arguments).exit_code == 0 and project.pairs.exists()
+
+
+def _sqlite_full() -> sqlite3.OperationalError:
+    with closing(sqlite3.connect(":memory:")) as connection:
+        connection.execute("PRAGMA max_page_count = 1")
+        try:
+            connection.execute("CREATE TABLE much (data)")
+            connection.execute("INSERT INTO much VALUES (zeroblob(99999))")
+        except sqlite3.OperationalError as fault:
+            return fault
+    raise AssertionError
+
+
+@pytest.mark.parametrize(
+    "fault", [OSError(errno.ENOSPC, "No space left on device", "/tmp/a"), _sqlite_full()]
+)
+def test_a_disk_that_is_full_at_any_write_is_one_sentence(
+    fault: Exception, monkeypatch: pytest.MonkeyPatch, project_copy: Callable[..., Project]
+) -> None:
+    def write(*arguments: object, **options: object) -> None:
+        raise fault
+
+    monkeypatch.setattr("colmap_netvlad.commands.pairs.make_pairs", write)
+    result = CliRunner().invoke(cli, ["pairs", "--db", str(project_copy().database)])
+    assert result.exit_code == 1 and isinstance(result.exception, SystemExit)
+    assert (
+        "Error: A disk is full (" in result.stderr and "goes on where it stopped" in result.stderr
+    )

@@ -103,14 +103,14 @@ def _match_apart(database: Path, folder: Path, pairs: Sequence[IdPair], seed: in
     try:
         copy_features(database, scratch, aliases)
         listed.write_text("".join(f"{aliases[a]} {aliases[b]}\n" for a, b in pairs))
-        _match(scratch, listed, database.parent, seed)
+        _match(scratch, listed, seed)
         copy_matches(scratch, database, [pair_id(*pair) for pair in pairs])
     finally:
         for used in folder.glob("matches.db*"):
             used.unlink()
 
 
-def _match(scratch: Path, listed: Path, watched: Path, seed: int) -> None:
+def _match(scratch: Path, listed: Path, seed: int) -> None:
     matching = pycolmap.FeatureMatchingOptions()
     if not pycolmap.has_cuda:
         matching.num_threads = 1
@@ -120,7 +120,7 @@ def _match(scratch: Path, listed: Path, watched: Path, seed: int) -> None:
     pairing.match_list_path = listed
     engine.call(
         pycolmap.match_image_pairs,
-        watched,
+        scratch.parent,
         scratch,
         matching_options=matching,
         pairing_options=pairing,
