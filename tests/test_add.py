@@ -149,6 +149,18 @@ def test_a_broken_new_photo_is_one_sentence(reconstructed: tuple[Project, list[P
         add_photos(project, newest_model(project), OPTIONS)
 
 
+def test_of_several_models_the_largest_is_extended(
+    reconstructed: tuple[Project, list[Path]],
+) -> None:
+    project, _ = reconstructed
+    model = pycolmap.Reconstruction(project.sparse / "0")
+    (project.sparse / "1").mkdir()
+    model.write(project.sparse / "1")
+    model.deregister_frame(model.reg_frame_ids()[0])
+    model.write(project.sparse / "0")
+    assert newest_model(project) == project.sparse / "1"
+
+
 def test_without_a_model_it_is_one_sentence(project_copy: Callable[..., Project]) -> None:
     with pytest.raises(InputError, match="no model in"):
         newest_model(project_copy())
