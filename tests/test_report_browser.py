@@ -106,3 +106,14 @@ def test_dark_mode_and_print_have_colours_of_their_own(browser, address):
         page.close()
     assert colours["light"][0] != colours["dark"][0]
     assert colours["light"][1] != colours["dark"][1]
+
+
+def test_a_photo_called_script_is_a_name(browser, tmp_path):
+    hostile = "<img src=x onerror=document.title='run'><script>document.title='run'</script>"
+    path = tmp_path / "compare.html"
+    names = tuple(f"{hostile}{i}.jpg" for i in range(20))
+    path.write_text(render_page(*made_up(20, names=names)), encoding="utf-8")
+    with watched_page(browser, path.as_uri(), 1280) as page:
+        title = page.title()
+        assert title and title != "run"
+        assert hostile in page.inner_text("main")
