@@ -16,7 +16,16 @@ from colmap_netvlad.cli import cli
 from colmap_netvlad.colmap.database import open_database
 from colmap_netvlad.commands.demo import run_demo
 from colmap_netvlad.demo.check import align, check_against_truth
-from colmap_netvlad.demo.render import FlightOptions, RenderedFlight, render_flight, to_wgs84
+from colmap_netvlad.demo.country import Country
+from colmap_netvlad.demo.overlap import true_overlaps, true_pairs
+from colmap_netvlad.demo.render import (
+    SEEN_FILE,
+    FlightOptions,
+    RenderedFlight,
+    render_flight,
+    to_wgs84,
+)
+from colmap_netvlad.runtime.errors import InputError
 
 
 def test_flight_reconstructs_whole_and_within_one_percent(
@@ -76,6 +85,61 @@ def test_blocks_are_separate_flights(tmp_path: Path):
     assert made.blocks.tolist() == [0, 0, 1, 1]
     assert len(set(made.names)) == 4
     assert np.linalg.norm(made.centres[0] - made.centres[2]) > 500
+
+
+def test_country_is_the_same_wherever_a_piece_of_it_begins():
+    one, other = (Country((west, 0), (west + 2, 1), cell=1.0, seed=3) for west in (0, 1))
+    side = one.shape[0]
+    for grid in ("height", "ground", "colour"):
+        # Shadows end at a piece's border.
+        mine = getattr(one, grid)[20:-20, side + 20 : -20]
+        theirs = getattr(other, grid)[20:-20, 20 : side - 20]
+        assert np.abs(mine - theirs).max() < 1e-3
+    assert one.colour.std() > 0.05
+
+
+def test_country_elsewhere_is_another_one():
+    grounds = [Country((west, 0), (west + 1, 1), cell=1.0, seed=3).colour for west in (0, 1, 2)]
+    assert not np.allclose(grounds[0], grounds[1])
+    assert not np.allclose(grounds[1], grounds[2])
+
+
+def test_large_flight_has_the_photos_asked_for_and_knows_which_overlap(tmp_path: Path):
+    options = FlightOptions.large(40, width=80, height=60, seed=1)
+    made = render_flight(tmp_path / "a", options)
+    assert len(made.names) == len(list(made.images.iterdir())) == 40
+    overlaps = true_overlaps(made).toarray()
+    assert (overlaps == overlaps.T).all()
+    assert not overlaps.diagonal().any()
+    steps = np.diff(made.centres[:, :2], axis=0)
+    along = np.flatnonzero(np.linalg.norm(steps, axis=1) < 30)
+    # 70 % forward by plan; drift, tilt and relief move it.
+    assert np.mean([overlaps[i, i + 1] for i in along]) == pytest.approx(0.66, abs=0.06)
+    far = np.linalg.norm(made.centres[:, None, :2] - made.centres[None, :, :2], axis=2) > 140
+    assert not overlaps[far].any()
+    much = np.argwhere(np.triu(overlaps >= 0.2)).tolist()
+    assert true_pairs(made) == [(made.names[i], made.names[j]) for i, j in much]
+    again = render_flight(tmp_path / "b", options)
+    for name in made.names:
+        assert (made.images / name).read_bytes() == (again.images / name).read_bytes()
+
+
+def test_flight_without_what_its_photos_show_is_rendered_again(tmp_path: Path):
+    options = FlightOptions(rows=1, columns=2, width=80, height=60)
+    made = render_flight(tmp_path, options)
+    (tmp_path / SEEN_FILE).unlink()
+    with pytest.raises(InputError, match="render the flight again"):
+        true_overlaps(made)
+
+
+@pytest.mark.parametrize("photos", ["0", "3", "10000", "many"])
+def test_demo_names_a_bad_number_of_photos_in_one_sentence(photos: str, tmp_path: Path):
+    output = tmp_path / "demo"
+    result = CliRunner().invoke(cli, ["demo", "--photos", photos, "--output", str(output)])
+    assert result.exit_code != 0
+    assert "--photos" in result.output
+    assert "Traceback" not in result.output
+    assert not output.exists()
 
 
 def test_legacy_database_has_the_schema_of_colmap_3_9(

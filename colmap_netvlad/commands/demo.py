@@ -18,6 +18,7 @@ from colmap_netvlad.commands.reconstruct import (
 from colmap_netvlad.demo.check import TruthCheck, check_against_truth
 from colmap_netvlad.demo.picture import draw_result
 from colmap_netvlad.demo.render import (
+    SEEN_FILE,
     FlightOptions,
     RenderedFlight,
     flight_exists,
@@ -97,7 +98,8 @@ def run_demo(
 def _flight(folder: Path, options: FlightOptions) -> RenderedFlight:
     if flight_exists(folder, options):
         flight = read_flight(folder)
-        if all((flight.images / name).is_file() for name in flight.names):
+        whole = [folder / SEEN_FILE, *(flight.images / name for name in flight.names)]
+        if all(file.is_file() for file in whole):
             return flight
     elif folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(f"{folder} holds something else; name a new folder with `output`.")

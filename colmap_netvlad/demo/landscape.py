@@ -14,11 +14,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Ground = Literal["village", "plantation", "bare", "copies"]
+Ground = Literal["village", "plantation", "bare", "copies", "country"]
 """village: fields, roads, houses, trees. plantation: equal palms in rows, the repetitive texture
 that confuses retrieval. bare: sand with few marks, the weak texture that starves SIFT. copies: the
 same estate, houses and orchard rows alike to the last tile, again and again on flat fields: look-
-alike places that verify as one."""
+alike places that verify as one. country: all kinds of ground in blocks between roads, as large as
+the flight asks (`demo.country`)."""
 
 ESTATE, ESTATE_STEP = 64.0, 110.0
 """Side of an estate of "copies", and the distance from one to its copy, m."""
@@ -28,6 +29,9 @@ Mask = NDArray[np.bool_]
 
 SUN = np.array([-0.55, 0.45, 0.7]) / np.linalg.norm([-0.55, 0.45, 0.7])
 """Unit vector towards the sun (east, north, up)."""
+
+SKYLIGHT, SUNLIGHT = (0.42, 0.44, 0.48), (0.70, 0.67, 0.61)
+"""RGB of what comes from the sky everywhere, and from the sun."""
 
 CROPS = (
     (0.33, 0.43, 0.20), (0.44, 0.50, 0.25), (0.62, 0.56, 0.34), (0.49, 0.39, 0.28),
@@ -65,6 +69,7 @@ class Landscape:
         wall_light: (H, W) float32, light on the wall, 0..1.
         eaves: (houses + 1,) float32, height where the wall ends and the roof begins, m.
         walls: (houses + 1, 3) float32, wall colours.
+        bottom, top: least and greatest of `height`, m.
     """
 
     def __init__(self, extent: Extent, cell: float, ground: Ground, seed: int) -> None:
@@ -75,9 +80,12 @@ class Landscape:
             round((extent.east - extent.west) / cell),
         )
         self._side = self.cell * max(self.shape)
-        rows, columns = np.mgrid[: self.shape[0], : self.shape[1]].astype(np.float32)
-        self._east = np.float32(extent.west) + (columns + 0.5) * np.float32(cell)
-        self._north = np.float32(extent.north) - (rows + 0.5) * np.float32(cell)
+        rows, columns = (np.arange(side, dtype=np.float32) for side in self.shape)
+        east = np.float32(extent.west) + (columns + np.float32(0.5)) * np.float32(cell)
+        north = np.float32(extent.north) - (rows + np.float32(0.5)) * np.float32(cell)
+        # Views of one row and one column: positions take no memory.
+        self._east: FloatImage = np.broadcast_to(east, self.shape)
+        self._north: FloatImage = np.broadcast_to(north[:, None], self.shape)
         self.ground = 14 * self._noise(90, 3) + 0.25 * self._noise(4, 2)
         self.height = self.ground.copy()
         self.house = np.zeros(self.shape, np.float32)
@@ -87,16 +95,12 @@ class Landscape:
         self._walls: list[tuple[float, float, float]] = [(0.0, 0.0, 0.0)]
         self._angle = self._rng.uniform(-0.6, 0.6)
         self._mottle = self._noise(2.0, 3)
-        {
-            "village": self._village,
-            "plantation": self._plantation,
-            "bare": self._bare,
-            "copies": self._copies,
-        }[ground]()
+        self._paint(ground)
         self._grain(0.015 if ground == "bare" else 0.07)
         self._light()
         self.eaves = np.array(self._eaves, np.float32)
         self.walls = np.array(self._walls, np.float32)
+        self.bottom, self.top = float(self.height.min()), float(self.height.max())
 
     def grid(self, east: FloatImage, north: FloatImage) -> tuple[FloatImage, FloatImage]:
         """Return grid columns and rows (cell centres at whole numbers) of ground positions."""
@@ -106,6 +110,14 @@ class Landscape:
         return columns, rows
 
     # Landscapes
+
+    def _paint(self, ground: Ground) -> None:
+        {
+            "village": self._village,
+            "plantation": self._plantation,
+            "bare": self._bare,
+            "copies": self._copies,
+        }[ground]()
 
     def _village(self) -> None:
         self._fields()
@@ -451,11 +463,12 @@ class Landscape:
             blocker = cv2.warpAffine(self.height, move, size, borderMode=cv2.BORDER_REPLICATE)
             above = blocker - self.height - np.float32(run * SUN[2] / horizontal)
             np.maximum(shadow, np.clip(above * 2, 0, 1), out=shadow)
-        sun = (light * (1 - self._soften(shadow, 0.15)))[..., None]
-        sky = np.array((0.42, 0.44, 0.48), np.float32)
-        self.colour = np.clip(
-            self.colour * (sky + np.array((0.70, 0.67, 0.61), np.float32) * sun), 0, 1
-        )
+        self._shine(light * (1 - self._soften(shadow, 0.15)))
+
+    def _shine(self, sun: NDArray[np.floating]) -> None:
+        """Light the colours by the sky and by (H, W) a share of the sun."""
+        sky, direct = np.array(SKYLIGHT, np.float32), np.array(SUNLIGHT, np.float32)
+        self.colour = np.clip(self.colour * (sky + direct * sun[..., None]), 0, 1)
 
     # Small tools
 

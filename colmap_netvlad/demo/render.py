@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,10 +13,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_netvlad.demo.country import SHEET_SIDE, sheet_of
 from colmap_netvlad.demo.exif import Exif, add_exif
 from colmap_netvlad.demo.landscape import Extent, Ground, Landscape
 from colmap_netvlad.runtime.errors import InputError
-from colmap_netvlad.runtime.files import write_atomically
+from colmap_netvlad.runtime.files import atomic_path, write_atomically
 from colmap_netvlad.runtime.progress import step
 
 Heights = NDArray[np.float32] | np.float32
@@ -34,6 +36,16 @@ BLOCK_OFFSET = np.array([1000.0, 0.0, 0.0])
 
 TRUTH_FILE = "truth.json"
 
+SEEN_FILE = "seen.npy"
+"""(N, P, 3) float32: the places on the surface that the middles of `SEEN_GRID` parts of each photo
+show, m east, north and up of the origin."""
+
+SEEN_GRID = (12, 9)
+"""Parts of a photo across and down."""
+
+MOST_PHOTOS = 9999
+"""Names have four digits."""
+
 
 @dataclass(frozen=True)
 class FlightOptions:
@@ -49,6 +61,7 @@ class FlightOptions:
         ground: kind of landscape.
         blocks: separate flights, each over a landscape of its own with nothing in common.
         seed: of landscape and jitter.
+        photos: the flight ends after so many on each block; 0: at the end of its last line.
     """
 
     rows: int = 5
@@ -61,6 +74,24 @@ class FlightOptions:
     ground: Ground = "village"
     blocks: int = 1
     seed: int = 0
+    photos: int = 0
+
+    @classmethod
+    def large(
+        cls, photos: int, width: int = 640, height: int = 480, seed: int = 0
+    ) -> FlightOptions:
+        """Return a flight of exactly `photos` photos over a square of country.
+
+        Raises:
+            InputError: fewer than 4 photos, or more than their names can count.
+        """
+        if not 4 <= photos <= MOST_PHOTOS:
+            raise InputError(f"`photos` is {photos}; a flight has 4 to {MOST_PHOTOS:,} of them.")
+        rows = max(2, round(math.sqrt(photos * height / width)))
+        columns = math.ceil(photos / rows)
+        return cls(
+            rows, columns, width=width, height=height, ground="country", seed=seed, photos=photos
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,40 +153,43 @@ def render_flight(folder: Path, options: FlightOptions = FlightOptions()) -> Ren
     )
     # First, so that a rendering which was stopped is known by its options.
     write_atomically(folder / TRUTH_FILE, json.dumps(_truth(flight, options), indent=1) + "\n")
+    seen = np.zeros((len(names), SEEN_GRID[0] * SEEN_GRID[1], 3), np.float32)
+    frame = options.width, options.height
     with step("Rendering the flight", len(names)) as bar, ThreadPoolExecutor(2) as pool:
-        for block, (centres, rotations) in enumerate(plans):
-            landscape = Landscape(
-                _extent(centres, options, focal),
-                0.8 * options.altitude / focal,
-                options.ground,
-                _block_seed(options, block),
-            )
+        for block, plan in enumerate(plans):
+            seed = _block_seed(options, block)
+            for landscape, photos in _landscapes(options, focal, plan[0], seed):
 
-            def photo(
-                i: int,
-                landscape: Landscape = landscape,
-                centres: NDArray[np.float64] = centres,
-                rotations: NDArray[np.float64] = rotations,
-                block: int = block,
-            ) -> None:
-                seen = render_photo(
-                    landscape, centres[i], rotations[i], focal, (options.width, options.height)
-                )
-                rng = np.random.default_rng([_block_seed(options, block), 2, i])
-                exif = _exif(centres[i] + block * BLOCK_OFFSET, i)
-                write_atomically(
-                    images / names[block * size + i], add_exif(_jpeg(_develop(seen, rng)), exif)
-                )
-                bar.advance()
+                def photo(
+                    i: int,
+                    block: int = block,
+                    plan: tuple[NDArray[np.float64], NDArray[np.float64]] = plan,
+                    landscape: Landscape = landscape,
+                    seed: int = seed,
+                ) -> None:
+                    view = landscape, plan[0][i], plan[1][i], focal, frame
+                    developed = _develop(render_photo(*view), np.random.default_rng([seed, 2, i]))
+                    number, shift = block * size + i, block * BLOCK_OFFSET
+                    exif = _exif(plan[0][i] + shift, i)
+                    write_atomically(images / names[number], add_exif(_jpeg(developed), exif))
+                    seen[number] = places_seen(*view) + shift
+                    bar.advance()
 
-            list(pool.map(photo, range(size)))
+                list(pool.map(photo, photos.tolist()))
+                del photo, landscape  # before the next one is painted
+    with atomic_path(folder / SEEN_FILE) as draft, draft.open("wb") as file:
+        np.save(file, seen)
     return flight
 
 
 def flight_exists(folder: Path, options: FlightOptions) -> bool:
     """Whether `render_flight` was begun in a folder with the same options."""
     truth = folder / TRUTH_FILE
-    return truth.is_file() and json.loads(truth.read_text()).get("options") == vars(options)
+    if not truth.is_file():
+        return False
+    # What did not exist when the flight was rendered was as it is by default.
+    begun = vars(FlightOptions()) | json.loads(truth.read_text()).get("options", {})
+    return begun == vars(options)
 
 
 def read_flight(folder: Path) -> RenderedFlight:
@@ -183,43 +217,11 @@ def render_photo(
 ) -> NDArray[np.float32]:
     """Return (H, W, 3) RGB in 0..1 of what a pinhole camera sees that looks down.
 
-    Each pixel's ray is followed down level by level until it is under the surface, then the
-    place is halved in. Houses and trees hide what lies behind them, as in a real photo.
+    Houses and trees hide what lies behind them, as in a real photo.
     """
-    width, height = size
-    # COLMAP's convention: the centre of the first pixel is (0.5, 0.5).
-    u, v = np.meshgrid(np.arange(width) + 0.5 - width / 2, np.arange(height) + 0.5 - height / 2)
-    rays = np.stack([u / focal, v / focal, np.ones_like(u)], -1) @ rotation
-    lean_e = (rays[..., 0] / rays[..., 2]).astype(np.float32)
-    lean_n = (rays[..., 1] / rays[..., 2]).astype(np.float32)
-
-    def place(up: Heights) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        below = up - np.float32(centre[2])
-        return landscape.grid(
-            np.float32(centre[0]) + below * lean_e, np.float32(centre[1]) + below * lean_n
-        )
-
-    def surface(up: Heights) -> NDArray[np.float32]:
-        return _look_up(landscape.height, *place(up))
-
-    top, bottom = float(landscape.height.max()), float(landscape.height.min())
-    levels = max(2, math.ceil((top - bottom) / 0.5))
-    drop = np.float32((top - bottom) / levels)
-    free = np.ones((height, width), bool)
-    depth = np.zeros((height, width), np.float32)
-    for level in range(1, levels + 1):
-        up = np.float32(top - level * drop)
-        free &= surface(up) < up
-        depth += free
-    above = np.float32(top) - depth * drop
-    under = above - drop
-    for _ in range(6):
-        middle = (above + under) * np.float32(0.5)
-        hit = surface(middle) >= middle
-        under = np.where(hit, middle, under)
-        above = np.where(hit, above, middle)
-
-    columns, rows = place(under)
+    lean_e, lean_n = _lean(rotation, focal, size, size)
+    under = _strike(landscape, centre, lean_e, lean_n)
+    columns, rows = landscape.grid(*_place(centre, lean_e, lean_n, under))
     colour = _look_up(landscape.colour, columns, rows)
     nearest = (landscape.house, landscape.wall_along, landscape.wall_light)
     house, along, light = (_look_up(grid, columns, rows, cv2.INTER_NEAREST) for grid in nearest)
@@ -236,6 +238,82 @@ def render_photo(
     return colour
 
 
+def places_seen(
+    landscape: Landscape,
+    centre: NDArray[np.float64],
+    rotation: NDArray[np.float64],
+    focal: float,
+    size: tuple[int, int],
+) -> NDArray[np.float32]:
+    """Return (P, 3) the places that the middles of `SEEN_GRID` parts of a photo show, m."""
+    lean_e, lean_n = _lean(rotation, focal, size, SEEN_GRID)
+    up = _strike(landscape, centre, lean_e, lean_n)
+    return np.stack([*_place(centre, lean_e, lean_n, up), up], -1).reshape(-1, 3)
+
+
+def _lean(
+    rotation: NDArray[np.float64], focal: float, size: tuple[int, int], parts: tuple[int, int]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return how far east and north the rays through the middles of a photo's parts (across,
+    down; its pixels, where there are as many) go for each metre up."""
+    # COLMAP's convention: the centre of the first pixel is (0.5, 0.5).
+    across, down = (
+        (np.arange(count) + 0.5) * (side / count) - side / 2
+        for side, count in zip(size, parts, strict=True)
+    )
+    u, v = np.meshgrid(across, down)
+    rays = np.stack([u / focal, v / focal, np.ones_like(u)], -1) @ rotation
+    return (
+        (rays[..., 0] / rays[..., 2]).astype(np.float32),
+        (rays[..., 1] / rays[..., 2]).astype(np.float32),
+    )
+
+
+def _place(
+    centre: NDArray[np.float64],
+    lean_e: NDArray[np.float32],
+    lean_n: NDArray[np.float32],
+    up: Heights,
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return east and north of where rays are at a height."""
+    below = up - np.float32(centre[2])
+    return np.float32(centre[0]) + below * lean_e, np.float32(centre[1]) + below * lean_n
+
+
+def _strike(
+    landscape: Landscape,
+    centre: NDArray[np.float64],
+    lean_e: NDArray[np.float32],
+    lean_n: NDArray[np.float32],
+) -> NDArray[np.float32]:
+    """Return the height at which each ray strikes the surface.
+
+    Each ray is followed down level by level until it is under the surface, then the place is
+    halved in.
+    """
+
+    def surface(up: Heights) -> NDArray[np.float32]:
+        return _look_up(landscape.height, *landscape.grid(*_place(centre, lean_e, lean_n, up)))
+
+    top, bottom = landscape.top, landscape.bottom
+    levels = max(2, math.ceil((top - bottom) / 0.5))
+    drop = np.float32((top - bottom) / levels)
+    free = np.ones(lean_e.shape, bool)
+    depth = np.zeros(lean_e.shape, np.float32)
+    for level in range(1, levels + 1):
+        up = np.float32(top - level * drop)
+        free &= surface(up) < up
+        depth += free
+    above = np.float32(top) - depth * drop
+    under = above - drop
+    for _ in range(6):
+        middle = (above + under) * np.float32(0.5)
+        hit = surface(middle) >= middle
+        under = np.where(hit, middle, under)
+        above = np.where(hit, above, middle)
+    return under
+
+
 def _look_up(
     grid: NDArray[np.float32],
     columns: NDArray[np.float32],
@@ -249,9 +327,31 @@ def _block_seed(options: FlightOptions, block: int) -> int:
     return options.seed * 1000 + block
 
 
+def _landscapes(
+    options: FlightOptions, focal: float, centres: NDArray[np.float64], seed: int
+) -> Iterator[tuple[Landscape, NDArray[np.intp]]]:
+    """Yield the ground under a flight, whole or sheet by sheet, and which photos show it."""
+    cell = 0.8 * options.altitude / focal
+    if options.ground != "country":
+        extent = _extent(centres, options, focal)
+        yield Landscape(extent, cell, options.ground, seed), np.arange(len(centres))
+        return
+    reach = _reach(options, focal)
+    sheets = np.floor(centres[:, :2] / SHEET_SIDE).astype(int)
+    for sheet in np.unique(sheets, axis=0):
+        photos = np.flatnonzero((sheets == sheet).all(axis=1))
+        column, row = sheet.tolist()
+        yield sheet_of(column, row, reach, cell, seed), photos
+
+
+def _reach(options: FlightOptions, focal: float) -> float:
+    """Return how far from below it a photo can see, with a margin for tilt and relief, m."""
+    return 0.65 * math.hypot(options.width, options.height) / focal * options.altitude
+
+
 def _extent(centres: NDArray[np.float64], options: FlightOptions, focal: float) -> Extent:
-    """Return the ground that photos from `centres` can see, with a margin for tilt and relief."""
-    reach = 0.65 * math.hypot(options.width, options.height) / focal * options.altitude
+    """Return the ground that photos from `centres` can see."""
+    reach = _reach(options, focal)
     west, south = (centres[:, :2].min(axis=0) - reach).tolist()
     east, north = (centres[:, :2].max(axis=0) + reach).tolist()
     return Extent(west, south, east, north)
@@ -287,7 +387,8 @@ def _plan(
             for e in places[:: 1 if i % 2 == 0 else -1]:
                 heading = math.pi / 2 if i % 2 == 0 else -math.pi / 2
                 shoot(e, n, 1.12 * options.altitude, heading)
-    return np.array(centres), np.array(rotations)
+    most = options.photos or None
+    return np.array(centres)[:most], np.array(rotations)[:most]
 
 
 def _rotation(yaw: float, pitch: float, roll: float) -> NDArray[np.float64]:
