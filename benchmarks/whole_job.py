@@ -8,15 +8,13 @@ Ours: `pairs` with the default method and k = 30, `reconstruct --matcher guided`
 that it chooses. Each runs in a process of its own on a copy of the database, one after the other;
 `--photos` renders a flight first. The vocabulary tree is made before and costs nothing here, as
 COLMAP downloads its own. Peak memory is of all processes together (proportional set size), looked
-at ten times a second; Linux only.
+at five times a second; Linux only.
 """
 
 from __future__ import annotations
 
 import json
 import math
-import resource
-import subprocess
 import sys
 import tempfile
 import time
@@ -30,6 +28,7 @@ import pycolmap
 from mappers import centres, offsets
 from rich.console import Console
 from rich.table import Table
+from watched import watch
 
 from colmap_netvlad.colmap import engine
 from colmap_netvlad.colmap.copies import copy_database
@@ -48,7 +47,6 @@ from colmap_netvlad.retrieval.options import RetrievalOptions
 from colmap_netvlad.terminal import Command
 
 K = 30
-LOOK_SECONDS = 0.1
 
 
 def colmap_way(project: Project, tree: Path) -> dict[str, float]:
@@ -76,54 +74,19 @@ def our_way(project: Project, matcher: str) -> dict[str, float]:
 def run_side(side: str, project: Project, tree: Path) -> dict[str, Any]:
     """Run one side in a process of its own, and return its figures."""
     arguments = [sys.executable, __file__, f"{project.database}:{project.images}"]
-    used, start, peak = _children(), time.monotonic(), 0
-    process = subprocess.Popen([*arguments, "--side", side, "--tree", str(tree)])
-    while process.poll() is None:
-        peak = max(peak, _memory(process.pid))
-        time.sleep(LOOK_SECONDS)
-    wall = time.monotonic() - start
-    if process.returncode:
-        raise SystemExit(f"The side {side} failed.")
+    took = watch([*arguments, "--side", side, "--tree", str(tree)])
     stages = json.loads((project.folder / "seconds.json").read_text())
     models = [pycolmap.Reconstruction(path) for path in sorted(project.sparse.glob("[0-9]*"))]
     pairs = verified_by_name(project.database)
     return {
-        "wall": wall,
-        "cpu": _children() - used,
-        "peak": peak,
+        "wall": took.wall,
+        "cpu": took.cpu,
+        "peak": took.peak,
         "stages": stages,
         "models": models,
         "pairs": len(pairs),
         "correct": len(correct_pairs(pairs)),
     }
-
-
-def _children() -> float:
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return used.ru_utime + used.ru_stime
-
-
-def _memory(root: int) -> int:
-    """Return the bytes of a process and of all it started."""
-    parents = {}
-    for stat in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            fields = stat.read_text().rpartition(")")[2].split()
-        except OSError:
-            continue
-        parents[int(stat.parent.name)] = int(fields[1])
-    family, size = {root}, 0
-    while len(family) != size:
-        size = len(family)
-        family |= {process for process, parent in parents.items() if parent in family}
-    total = 0
-    for process in family:
-        try:
-            lines = Path(f"/proc/{process}/smaps_rollup").read_text().splitlines()
-        except OSError:
-            continue
-        total += sum(1024 * int(line.split()[1]) for line in lines if line.startswith("Pss:"))
-    return total
 
 
 def rendered(photos: int, folder: Path) -> tuple[Project, float]:

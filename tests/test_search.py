@@ -88,12 +88,48 @@ def test_hnsw_serves_images_that_its_graph_does_not_reach() -> None:
     np.testing.assert_allclose(scores, 1, atol=1e-3)
 
 
+def test_reduced_search_finds_what_exact_search_finds_and_the_same_twice(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    # More values than axes; which of its group are nearest to a photo lies beside the axes.
+    vectors = clustered(1500, 600, 0, clusters=40)
+    monkeypatch.setattr(search, "EXACT_UP_TO", 0)
+    monkeypatch.setattr(search, "AXES", 64)
+    monkeypatch.setattr(search, "SAMPLE", 500)
+    first, scores = nearest(vectors, 20)
+    second, _ = nearest(vectors, 20)
+    np.testing.assert_array_equal(first, second)
+    truth, true_scores = nearest(vectors, 20, exact=True)
+    found = np.mean([len(set(a) & set(b)) / 20 for a, b in zip(first, truth, strict=True)])
+    assert found > 0.98
+    np.testing.assert_allclose(scores, true_scores, atol=0.01)
+    monkeypatch.setattr(search, "SHORTLIST", 0)
+    alone, _ = nearest(vectors, 20)
+    assert np.mean([len(set(a) & set(b)) / 20 for a, b in zip(alone, truth, strict=True)]) < found
+
+
+@given(count=st.integers(2, 40), k=st.integers(1, 50), dim=st.integers(1, 9), copies=st.booleans())
+@settings(max_examples=30, deadline=None)
+def test_reduced_search_gives_every_image_others_and_none_twice(
+    count: int, k: int, dim: int, copies: bool
+) -> None:
+    vectors = clustered(count, dim, count, clusters=3)
+    if copies:
+        vectors[:] = vectors[0]
+    k = min(k, count - 1)
+    partners, scores = search._reduced(vectors, k)
+    assert partners.shape == scores.shape == (count, k)
+    for i, row in enumerate(partners.tolist()):
+        assert i not in row
+        assert len(set(row)) == k
+
+
 def test_the_method_of_search_is_chosen_by_the_number_of_images(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     vectors = clustered(30, 8, 0)
     used = []
-    for name in ("_exact", "_hnsw"):
+    for name in ("_exact", "_reduced", "_hnsw"):
         real = getattr(search, name)
         monkeypatch.setattr(
             search, name, lambda *a, name=name, real=real: used.append(name) or real(*a)
@@ -101,7 +137,9 @@ def test_the_method_of_search_is_chosen_by_the_number_of_images(
     nearest(vectors, 3)
     monkeypatch.setattr(search, "EXACT_UP_TO", 29)
     nearest(vectors, 3)
-    assert used == ["_exact", "_hnsw"]
+    nearest(vectors, 3, exact=True)
+    nearest(vectors, 3, exact=False)
+    assert used == ["_exact", "_reduced", "_exact", "_hnsw"]
 
 
 def test_half_precision_and_a_single_image_are_served() -> None:

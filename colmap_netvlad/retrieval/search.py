@@ -1,8 +1,9 @@
 """The nearest neighbours of every descriptor among all others, by inner product.
 
-Exact search multiplies blocks of descriptors with each other; HNSW (the paper's section 4.2)
-builds faiss' graph index. Both read the descriptors in blocks, so a store larger than memory
-serves as well as an array, and neither makes an N x N matrix.
+Exact search multiplies blocks of descriptors with each other. Reduced search does so with their
+parts along the principal axes and orders what it finds by the whole descriptors, a byte a value.
+HNSW (the paper's section 4.2) builds faiss' graph index. All read the descriptors in blocks, so a
+store larger than memory serves as well as an array, and none makes an N x N matrix.
 """
 
 from __future__ import annotations
@@ -18,10 +19,17 @@ from colmap_netvlad.runtime.progress import step
 from colmap_netvlad.runtime.sequences import blocks
 
 EXACT_UP_TO = 20_000
-"""Exact search up to this number of images, HNSW above. `benchmarks/search_scale.py --switch`
-measures both; up to here, the largest flights we serve, exact was the faster one (4 times at
-20,000 images of 4,096 values on 2 busy cores). HNSW grows more slowly, but its graph must be
-built on one thread to be the same every time."""
+"""Exact search up to this number of images, reduced search above
+(`benchmarks/search_scale.py --reduced`)."""
+
+AXES = 256
+"""Values of a reduced descriptor."""
+
+SAMPLE = 2048
+"""Descriptors, spread over all, that the principal axes are of."""
+
+SHORTLIST = 400
+"""Least number of reduced search's finds for each image that the whole descriptors order."""
 
 BLOCK_BYTES = 64 << 20
 """Memory of one block of descriptors as float32."""
@@ -56,7 +64,8 @@ def nearest(
     Args:
         vectors: (N, D) L2-normalised descriptors, N > k.
         k: partners of each row, clamped to N - 1.
-        exact: True for exact search, False for HNSW, None to choose by `EXACT_UP_TO`.
+        exact: True for exact search, False for HNSW, None for exact search up to `EXACT_UP_TO`
+            images and reduced search above.
         seed: of HNSW's random levels.
 
     Returns:
@@ -66,9 +75,9 @@ def nearest(
     k = min(k, count - 1)
     if k < 1:
         return np.zeros((count, 0), np.int32), np.zeros((count, 0), np.float32)
-    if exact is None:
-        exact = count <= EXACT_UP_TO
-    return _exact(vectors, k) if exact else _hnsw(vectors, k, seed)
+    if exact is False:
+        return _hnsw(vectors, k, seed)
+    return _exact(vectors, k) if exact or count <= EXACT_UP_TO else _reduced(vectors, k)
 
 
 def _exact(vectors: Vectors | NDArray[np.floating], k: int) -> Neighbours:
@@ -115,26 +124,75 @@ def _merge(
 def _hnsw(vectors: Vectors | NDArray[np.floating], k: int, seed: int) -> Neighbours:
     import faiss
 
-    count, dim = vectors.shape
+    _, dim = vectors.shape
     float16 = faiss.ScalarQuantizer.QT_fp16
     index: Any = faiss.IndexHNSWSQ(dim, float16, HNSW_LINKS, faiss.METRIC_INNER_PRODUCT)  # type: ignore[arg-type]
     index.is_trained = True  # float16 codes have nothing to learn
     index.hnsw.rng = faiss.RandomGenerator(seed)  # type: ignore[attr-defined]
     index.hnsw.efConstruction = HNSW_BUILD
-    # Two more than asked for: the row itself, and a spare.
     index.hnsw.efSearch = max(2 * (k + 2), 64)
-    partners = np.zeros((count, k), np.int32)
-    scores = np.zeros((count, k), np.float32)
-    parts = _blocks_of(vectors)
-    with step("Indexing descriptors", count) as bar, _one_thread(faiss):
-        for rows in parts:
+    with _one_thread(faiss):
+        _fill(index, vectors)
+    return _ask(index, vectors, k)
+
+
+def _reduced(vectors: Vectors | NDArray[np.floating], k: int) -> Neighbours:
+    import faiss
+
+    _, dim = vectors.shape
+    sample = _spread(vectors, SAMPLE)
+    axes = _principal_axes(sample, AXES)
+    turn = faiss.LinearTransform(dim, len(axes), False)
+    faiss.copy_array_to_vector(axes.ravel(), turn.A)
+    turn.is_trained = True
+    coarse: Any = faiss.IndexPreTransform(turn, faiss.IndexFlatIP(len(axes)))
+    byte = faiss.ScalarQuantizer.QT_8bit
+    fine: Any = faiss.IndexScalarQuantizer(dim, byte, faiss.METRIC_INNER_PRODUCT)
+    fine.train(sample)
+    index: Any = faiss.IndexRefine(coarse, fine)
+    index.k_factor = max(1.0, SHORTLIST / (k + 2))
+    _fill(index, vectors)
+    return _ask(index, vectors, k)
+
+
+def _spread(vectors: Vectors | NDArray[np.floating], count: int) -> NDArray[np.float32]:
+    """Return at most `count` rows, an equal share of each block's."""
+    step = max(-(-vectors.shape[0] // count), 1)
+    rows = [_load(vectors, part)[-part.start % step :: step] for part in _blocks_of(vectors)]
+    return np.concatenate(rows)
+
+
+def _principal_axes(sample: NDArray[np.float32], count: int) -> NDArray[np.float32]:
+    """Return at most `count` orthonormal axes, largest share of the sample first.
+
+    They are those of the sample as it is, its mean not taken off, since inner products are to be
+    kept: with the mean taken off, 3 % less of the 100 nearest were found.
+    """
+    values, vectors = np.linalg.eigh((sample @ sample.T).astype(np.float64))
+    kept = np.flatnonzero(values > 1e-6 * values[-1])[::-1][:count]
+    axes = vectors[:, kept].T @ sample / np.sqrt(values[kept])[:, None]
+    return np.ascontiguousarray(axes, np.float32)
+
+
+def _fill(index: Any, vectors: Vectors | NDArray[np.floating]) -> None:
+    with step("Indexing descriptors", vectors.shape[0]) as bar:
+        for rows in _blocks_of(vectors):
             block = _load(vectors, rows)
             index.add(block)
             bar.advance(len(block))
+
+
+def _ask(index: Any, vectors: Vectors | NDArray[np.floating], k: int) -> Neighbours:
+    """Ask a faiss index for the neighbours of all that is in it."""
+    count = vectors.shape[0]
+    partners = np.zeros((count, k), np.int32)
+    scores = np.zeros((count, k), np.float32)
+    parts = _blocks_of(vectors)
     short: list[int] = []
     with step("Searching neighbours", count) as bar:
         for rows in parts:
             block = _load(vectors, rows)
+            # Two more than asked for: the row itself, and a spare.
             found_scores, found = index.search(block, min(k + 2, count))
             for i, (row, row_scores) in enumerate(zip(found, found_scores, strict=True)):
                 # The row itself is removed by its number: with duplicates it is not always first.
