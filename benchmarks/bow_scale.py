@@ -42,7 +42,7 @@ def main() -> None:
         ids = list(database.descriptor_counts())
         pool = sample_descriptors(database, ids, len(ids), POOL, 0).astype(np.float32)
     rng = np.random.default_rng(0)
-    keypoints = [pycolmap.FeatureKeypoint() for _ in range(options.features)]
+    keypoints = pycolmap.FeatureKeypoints([pycolmap.FeatureKeypoint()] * options.features)
 
     def image() -> pycolmap.FeatureDescriptorsFloat:
         drawn = pool[rng.integers(len(pool), size=options.features)]
