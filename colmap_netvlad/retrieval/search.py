@@ -22,7 +22,7 @@ EXACT_UP_TO = 20_000
 """Exact search up to this number of images, reduced search above
 (`benchmarks/search_scale.py --reduced`)."""
 
-AXES = 256
+AXES = 128
 """Values of a reduced descriptor."""
 
 SAMPLE = 2048
