@@ -113,26 +113,30 @@ def bow(project: Project, photos: int) -> dict[str, Any]:
     }
 
 
-def quality(project: Project, photos: int) -> dict[str, Any]:
-    """Hold rankings, pairs and model against the truth."""
-    flight = read_flight(project.folder)
-    truth = true_pairs(flight)
+def retrieval(project: Project, photos: int) -> dict[str, Any]:
+    """Hold the ranking and the pairs against the truth."""
+    truth = true_pairs(read_flight(project.folder))
     ranking = rank_project(project, DEFAULT, RetrievalOptions(k=K))
     chosen = read_pairs(project.pairs, ranking.names)
-    verified = verified_by_name(project.database)
-    found = retrieved(ranking, truth)
-    models = [
-        pycolmap.Reconstruction(folder)
-        for folder in sorted(Path((project.folder / "model.txt").read_text()).glob("[0-9]*"))
-    ]
-    check = check_against_truth(models, flight)
-    largest = max(models, key=lambda model: model.num_reg_images())
     return {
-        **found,
+        **retrieved(ranking, truth),
         "true pairs": len(truth),
         "pairs recall": recall(chosen, truth),
-        "pairs accuracy": share_of_true(chosen, truth),
-        "verified true": recall(correct_pairs(verified), truth),
+        "pairs accuracy": len(set(chosen) & set(truth)) / len(chosen),
+        "cache": project.cache.stat().st_size,
+    }
+
+
+def model(project: Project, photos: int) -> dict[str, Any]:
+    """Hold what verified and the largest model against the truth."""
+    flight = read_flight(project.folder)
+    folders = Path((project.folder / "model.txt").read_text()).glob("[0-9]*")
+    models = [pycolmap.Reconstruction(folder) for folder in sorted(folders)]
+    largest = max(models, key=lambda model: model.num_reg_images())
+    check = check_against_truth(models, flight)
+    correct = correct_pairs(verified_by_name(project.database))
+    return {
+        "verified recall": recall(correct, true_pairs(flight)),
         "registered": check.registered,
         "off mean": check.mean,
         "off max": check.largest,
@@ -140,7 +144,6 @@ def quality(project: Project, photos: int) -> dict[str, Any]:
         "points": largest.num_points3D(),
         "error": largest.compute_mean_reprojection_error(),
         "database": project.database.stat().st_size,
-        "cache": project.cache.stat().st_size,
     }
 
 
@@ -152,20 +155,20 @@ def retrieved(ranking: Any, truth: list[tuple[str, str]]) -> dict[str, float]:
     }
 
 
-def share_of_true(chosen: list[tuple[str, str]], truth: list[tuple[str, str]]) -> float:
-    return len(set(chosen) & set(truth)) / len(chosen)
-
-
 STAGES: dict[str, Callable[[Project, int], dict[str, Any]]] = {
     "render": render,
     "features": features,
     "pairs": pairs,
-    "matching": matching,
-    "mapping": mapping,
-    "quality": quality,
+    "retrieval": retrieval,
     "tree": tree,
     "bow": bow,
+    "matching": matching,
+    "mapping": mapping,
+    "model": model,
 }
+
+CHECKS = ("retrieval", "model")
+"""Stages that only look at the result."""
 
 
 def project_of(folder: Path) -> Project:
@@ -222,7 +225,7 @@ def show(output: Path) -> None:
     axes = figure.subplots()
     for stage in STAGES:
         done = [n for n in sizes if all_figures[n].get(stage, {}).get("done")]
-        if done and stage != "quality":
+        if done and stage not in CHECKS:
             seconds = [all_figures[n][stage]["cpu"] for n in done]
             axes.plot(done, seconds, "o-", label=stage, markersize=4)
     if sizes:
