@@ -576,8 +576,8 @@ def demo(output: Path, method: str | None, photos: int | None, seed: int) -> Non
     """Render a drone flight, reconstruct it, and check the result against the truth.
 
     Takes about two minutes; with --photos about three for every 100 of them, on two processors, and
-    some 2 GB of memory for drawing the ground. Exit code 1 where a photo is not registered, or a camera centre is
-    off by more than 1 % of the flight's extent.
+    some 2 GB of memory for drawing the ground. Exit code 1 where a photo is not registered, or a
+    camera centre is off by more than 1 % of the flight's extent.
     """
     from colmap_netvlad.commands.demo import DEMO_FLIGHT, run_demo
     from colmap_netvlad.commands.reconstruct import ReconstructReport
