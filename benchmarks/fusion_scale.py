@@ -104,7 +104,7 @@ def searched(seed: int) -> Callable[..., Ranking]:
     return candidates
 
 
-def compared(pairs: NDArray[np.intp], ids: NDArray[np.int64], store: Store) -> None:
+def compared(pairs: NDArray[np.intp], ids: NDArray[np.int64], store: Store, *_: Any) -> None:
     """Keep counts of pairs that fall with the distance."""
     ground = grid(len(ids))
     apart = np.linalg.norm(ground[pairs[:, 0]] - ground[pairs[:, 1]], axis=1)
