@@ -8,6 +8,7 @@ import re
 import sqlite3
 from contextlib import closing
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -188,8 +189,8 @@ def test_each_missing_photo_has_its_reason(project_copy):
         ids = dict(connection.execute("SELECT name, image_id FROM images"))
         connection.execute("UPDATE keypoints SET rows = 0 WHERE image_id = ?", (ids[names[0]],))
         pairs = "pair_id / 2147483647 = {0} OR pair_id % 2147483647 = {0}"
-        for table in ("two_view_geometries", "matches"):
-            connection.execute(f"DELETE FROM {table} WHERE {pairs.format(ids[names[1]])}")
+        for name, table in product(names[:2], ("two_view_geometries", "matches")):
+            connection.execute(f"DELETE FROM {table} WHERE {pairs.format(ids[name])}")
         own = pairs.format(ids[names[2]])
         connection.execute(
             f"UPDATE two_view_geometries SET rows = 3, data = substr(data, 1, 24)"

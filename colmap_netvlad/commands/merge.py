@@ -194,7 +194,7 @@ def _in_database(
         raise InputError(
             f"{len(strangers)} photos of {name} (first: {strangers[0]}) are not in "
             f"{project.database}: bring the projects into one database first (COLMAP's "
-            "`database_merger`; image names stay and must differ), or import all photos into one "
+            "database_merger; image names stay and must differ), or import all photos into one "
             "with `colmap-netvlad features`."
         )
     opened = pycolmap.Database.open(project.database)

@@ -232,10 +232,10 @@ def weigh_database(
 def hull_area(keypoints: NDArray[np.float32], indices: NDArray[np.uint32]) -> float:
     """Return the area in square pixels of the convex hull of matched keypoints.
 
-    It is 0 for fewer than three points and for points on one line. Indices beyond the
-    keypoints and positions that are not finite (a damaged database) are left out.
+    It is 0 for fewer than three points and for points on one line. Positions that are not finite
+    (a damaged database) are left out.
     """
-    points = keypoints[indices[indices < len(keypoints)]]
+    points = keypoints[indices]
     points = points[np.isfinite(points).all(axis=1)]
     if len(points) < 3:
         return 0.0
