@@ -88,7 +88,7 @@ def test_hull_area_is_the_hand_computed_one() -> None:
 
 @pytest.mark.parametrize("points", [LINE, SQUARE[:2], SQUARE[:0], np.full((4, 2), np.nan)])
 def test_hulls_without_area_are_zero(points: np.ndarray) -> None:
-    assert hull_area(points.astype(np.float32), np.arange(9, dtype=np.uint32)) == 0
+    assert hull_area(points.astype(np.float32), np.arange(len(points), dtype=np.uint32)) == 0
 
 
 @given(
