@@ -5,6 +5,7 @@ import os
 import pickle
 import signal
 import sys
+import time
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -157,6 +158,22 @@ def test_results_of_many_shares_come_from_few_processes() -> None:
     assert sorted([*first, *(number for result in results for number in result)]) == list(
         range(0, 80, 2)
     )
+
+
+def wait_until_unwanted(share: Sequence[int]) -> int:
+    start = time.monotonic()
+    while share[0] and not workers.unwanted() and time.monotonic() - start < 60:
+        time.sleep(0.01)
+    return share[0]
+
+
+def test_shares_whose_results_nobody_waits_for_can_stop() -> None:
+    results = workers.results(wait_until_unwanted, range(20), 2)
+    assert next(results) == 0
+    start = time.monotonic()
+    results.close()
+    assert time.monotonic() - start < 5
+    assert not workers.unwanted()
 
 
 def test_what_a_share_raises_ends_the_work() -> None:

@@ -163,10 +163,12 @@ def _match_block(options: MatchOptions, database: Path, pairs: Sequence[IdPair])
 def match_block(
     photos: Photos, database: Path, options: MatchOptions, pairs: Sequence[IdPair]
 ) -> BlockReport:
-    """Match and verify the pairs of a block."""
+    """Match and verify the pairs of a block; after Ctrl-C, no more of them."""
     report, start = BlockReport(), time.monotonic()
     with _one_thread(), open_database(database, LOCK_SECONDS) as colmap:
         for pair in pairs:
+            if workers.unwanted():
+                break
             both = photos.get(colmap, pair[0]), photos.get(colmap, pair[1])
             matched = match(both[0].features, both[1].features, options.thorough)
             report.given_up += matched.stage is Stage.GIVEN_UP

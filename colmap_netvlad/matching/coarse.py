@@ -105,6 +105,16 @@ def mutual(
     return np.stack([first[i[keep]], second[j[keep]]], axis=1), ratio
 
 
+def distinct(one: SiftFeatures, other: SiftFeatures, matches: Matches) -> NDArray[np.bool_]:
+    """Return (M,) whether matches pass COLMAP's ratio test both ways among all features."""
+    i, j = matches.T
+    there = nearest(one.codes[i], other.codes)
+    keep = there.distinct(MAX_RATIO) & (there.best == j)
+    back = nearest(other.codes[j[keep]], one.codes)
+    keep[keep] = back.distinct(MAX_RATIO) & (back.best == i[keep])
+    return keep
+
+
 def agreements(one: SiftFeatures, other: SiftFeatures, matches: Matches) -> NDArray[np.bool_]:
     """Return (M, M) whether two matches each lie where the other predicts; of itself, True."""
     i, j = matches.T

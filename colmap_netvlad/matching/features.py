@@ -12,6 +12,8 @@ from zlib import crc32
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_netvlad.matching.nearest import Codes
+
 SIFT_BYTES = 128
 """Length of a SIFT descriptor."""
 
@@ -28,19 +30,23 @@ class SiftFeatures:
         at: (N, 2) x, y, pixels; NaN where the keypoint is not finite.
         log_scale: (N,) natural logarithm of the scale.
         angle: (N,) orientation, rad.
-        codes: (N, 128) descriptors less 128; of nothing but zeros where the keypoint is not
-            finite, which is like nothing.
+        codes: of the N descriptors; of nothing but zeros where the keypoint is not finite, which
+            is like nothing.
         largest: (<= N,) finite features, those of the largest scales first.
         blocks: features in groups that lie together, without those that are not finite.
+        centres: (B, 2) mean place of each block.
+        corners: (2, 2) least and most x, y of all; NaN where there is none.
         checksum: of keypoints and descriptors.
     """
 
     at: NDArray[np.float32]
     log_scale: NDArray[np.float32]
     angle: NDArray[np.float32]
-    codes: NDArray[np.int8]
+    codes: Codes
     largest: NDArray[np.intp]
     blocks: tuple[NDArray[np.intp], ...]
+    centres: NDArray[np.float64]
+    corners: NDArray[np.float64]
     checksum: int
 
     def __len__(self) -> int:
@@ -64,16 +70,19 @@ def prepare(keypoints: NDArray[np.float32], descriptors: NDArray[np.uint8]) -> S
     scale, angle = _scale_and_angle(keypoints)
     good = np.isfinite(keypoints).all(axis=1) & (scale > 0)
     at = np.where(good[:, None], keypoints[:, :2], np.nan).astype(np.float32)
-    codes = np.where(good[:, None], descriptors, 0) ^ 128
-    codes = codes.astype(np.uint8).view(np.int8)
+    if not good.all():
+        descriptors = np.where(good[:, None], descriptors, np.uint8(0))
     order = np.argsort(-np.where(good, scale, 0), kind="stable")[: good.sum()]
+    blocks = tuple(_blocks(at, np.flatnonzero(good)))
     return SiftFeatures(
         at=at,
         log_scale=np.log(np.where(good, scale, 1)).astype(np.float32),
         angle=np.where(good, angle, 0).astype(np.float32),
-        codes=codes,
+        codes=Codes.of(descriptors),
         largest=order,
-        blocks=tuple(_blocks(at, np.flatnonzero(good))),
+        blocks=blocks,
+        centres=np.array([at[block].mean(axis=0, dtype=float) for block in blocks]).reshape(-1, 2),
+        corners=_corners(at[good]),
         checksum=crc32(descriptors.tobytes(), crc32(keypoints.tobytes())),
     )
 
@@ -89,6 +98,12 @@ def _scale_and_angle(
         a11, a12, a21, a22 = shape.T
         return np.sqrt(np.abs(a11 * a22 - a12 * a21)), np.arctan2(a21, a11)
     return np.ones(len(shape)), np.zeros(len(shape))
+
+
+def _corners(at: NDArray[np.float32]) -> NDArray[np.float64]:
+    if len(at) == 0:
+        return np.full((2, 2), np.nan)
+    return np.stack([at.min(axis=0), at.max(axis=0)]).astype(float)
 
 
 def _blocks(at: NDArray[np.float32], features: NDArray[np.intp]) -> list[NDArray[np.intp]]:

@@ -86,12 +86,13 @@ def _search(
     angle, ratio = np.full((2, len(one)), np.inf, np.float32)
     carried = _ones(one.at.astype(float)) @ guide.affine
     x, y = other.at.T.copy()
-    corners = np.nanmin(other.at, axis=0), np.nanmax(other.at, axis=0)
-    low, high = guide.near(np.array([one.at[block].mean(axis=0) for block in one.blocks]))
+    low, high = guide.near(one.centres)
     low, high = low - guide.margin, high + guide.margin
     for block, least, most in zip(one.blocks, low, high, strict=True):
         places = carried[block]
-        seen = ((places + most >= corners[0]) & (places + least <= corners[1])).all(axis=1)
+        seen = places + most >= other.corners[0]
+        seen &= places + least <= other.corners[1]
+        seen = seen.all(axis=1)
         block, places = (rows[seen & wanted[block]] for rows in (block, places))
         if not len(block):
             continue
@@ -109,5 +110,4 @@ def _ones(at: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _margin(features: SiftFeatures) -> float:
-    extent = np.nanmax(features.at, axis=0) - np.nanmin(features.at, axis=0)
-    return MARGIN * float(np.hypot(*extent))
+    return MARGIN * float(np.hypot(*np.ptp(features.corners, axis=0)))

@@ -14,8 +14,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-BLOCK = 128
-"""Rows of a product: with 8,192 columns of 4 bytes it stays in the processor's cache."""
+PRODUCT = 2**20
+ROWS = (128, 512)
+"""Entries of a product, of 4 bytes, so that it stays in the processor's cache; its rows, least and
+most: of few columns, more rows save calls."""
 
 NORM = 1 / 512**2
 """Of the products of two descriptors."""
@@ -33,6 +35,32 @@ MAX_ANGLE = 0.7
 MAX_RATIO = 0.8
 """COLMAP's: largest angle (rad) between descriptors that match, and largest ratio to that of the
 second best."""
+
+
+@dataclass(frozen=True, eq=False)
+class Codes:
+    """Descriptors less `LOWER`.
+
+    Attributes:
+        values: (N, 128).
+        shift: (N,) the part of the products of descriptors that depends on one of them alone, as
+            (a + 128)(b + 128) = ab + 128 a + 128 b + 128 * 128 for each of their values.
+    """
+
+    values: NDArray[np.int8]
+    shift: NDArray[np.int32]
+
+    @classmethod
+    def of(cls, descriptors: NDArray[np.uint8]) -> Codes:
+        """Return the codes of (N, 128) descriptors."""
+        values = (descriptors ^ LOWER).view(np.int8)
+        return cls(values, LOWER * values.sum(axis=1, dtype=np.int32))
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    def __getitem__(self, rows: NDArray[np.intp] | slice) -> Codes:
+        return Codes(self.values[rows], self.shift[rows])
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,25 +82,26 @@ class Nearest:
         return (self.best >= 0) & (self.angle <= MAX_ANGLE) & (self.ratio < max_ratio)
 
 
-def nearest(queries: NDArray[np.int8], codes: NDArray[np.int8]) -> Nearest:
-    """Return the nearest of (N, 128) codes to each of (M, 128) queries."""
+def nearest(queries: Codes, codes: Codes) -> Nearest:
+    """Return the nearest of N codes to each of M queries."""
     count = len(queries)
     best = np.full(count, -1, np.intp)
     first, second = np.zeros((2, count), np.int32)
-    if len(codes):
+    if count and len(codes):
         kind = bytes_or_floats()
-        transposed = torch.from_numpy(codes).to(kind).T
-        shift = _shift(codes).astype(np.int32 if kind == torch.int8 else np.float32)
-        for start in range(0, count, BLOCK):
-            part = slice(start, start + BLOCK)
-            products = _products(torch.from_numpy(queries[part]).to(kind), transposed)
+        rows_of, columns = torch.from_numpy(queries.values), torch.from_numpy(codes.values).to(kind)
+        shift = codes.shift.astype(np.int32 if kind == torch.int8 else np.float32)
+        step = int(np.clip(PRODUCT // len(codes), *ROWS))
+        for start in range(0, count, step):
+            part = slice(start, start + step)
+            products = _products(rows_of[part].to(kind), columns.T)
             np.add(products, shift, out=products)
             rows = np.arange(len(products))
             best[part] = products.argmax(axis=1)
             first[part] = products[rows, best[part]]
             products[rows, best[part]] = NONE
             second[part] = products[rows, products.argmax(axis=1)]
-        rest = _shift(queries) + LOWER**2 * queries.shape[1]
+        rest = queries.shift + LOWER**2 * queries.values.shape[1]
         first += rest
         second = np.where(second == NONE, 0, second + rest)
     angle, other = _angle(first), _angle(second)
@@ -99,7 +128,7 @@ def _seconds(kind: torch.dtype) -> float:
     for _ in range(5):
         start = time.perf_counter()
         try:
-            _products(codes[:BLOCK], codes.T)
+            _products(codes[: ROWS[0]], codes.T)
         except (RuntimeError, NotImplementedError):
             return float("inf")
         times.append(time.perf_counter() - start)
@@ -109,11 +138,6 @@ def _seconds(kind: torch.dtype) -> float:
 def _products(a: torch.Tensor, b: torch.Tensor) -> NDArray[np.int32] | NDArray[np.float32]:
     """Return (M, N) the products of rows and columns, of bytes as int32."""
     return (torch._int_mm(a, b) if a.dtype == torch.int8 else a @ b).numpy()
-
-
-def _shift(codes: NDArray[np.int8]) -> NDArray[np.int32]:
-    """Return (N,) the part of (a + `LOWER`)(b + `LOWER`) that depends on one code alone."""
-    return LOWER * codes.sum(axis=1, dtype=np.int32)
 
 
 def _angle(products: NDArray[np.int32]) -> NDArray[np.float32]:

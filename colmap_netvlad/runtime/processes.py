@@ -16,6 +16,7 @@ from concurrent.futures.process import BrokenProcessPool
 from functools import partial
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
+from multiprocessing.synchronize import Event
 from typing import Any
 
 from colmap_netvlad.runtime.errors import InputError
@@ -110,7 +111,8 @@ class Processes:
         """Work at shares in a pool of processes."""
         called = function if source is None else partial(function, source.path)
         context = multiprocessing.get_context("spawn")
-        pool = ProcessPoolExecutor(workers, context, _begin, (initialiser,))
+        stop = context.Event()
+        pool = ProcessPoolExecutor(workers, context, _begin_shares, (stop, initialiser))
         running: dict[Future[tuple[float, Result]], int] = {}
         try:
             while shares or running:
@@ -129,6 +131,7 @@ class Processes:
                 "perhaps; run the command again: it goes on where it stopped."
             ) from fault
         finally:
+            stop.set()
             pool.shutdown(cancel_futures=True)
 
     def stream(
@@ -198,6 +201,21 @@ def _work(job: Job, counter: Any, sender: Connection, initialiser: Callable[[], 
     except Exception as unknown:
         fault = f"{type(unknown).__name__}: {unknown}"
     sender.send((fault, peak_bytes(), time.monotonic() - start))
+
+
+_stop: Event | None = None
+"""Of a process that works at shares."""
+
+
+def unwanted() -> bool:
+    """Return whether this process is at a share whose result nobody waits for any longer."""
+    return _stop is not None and _stop.is_set()
+
+
+def _begin_shares(stop: Event, initialiser: Callable[[], None]) -> None:
+    global _stop
+    _stop = stop
+    _begin(initialiser)
 
 
 def _begin(initialiser: Callable[[], None]) -> None:

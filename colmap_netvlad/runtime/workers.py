@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 
+from colmap_netvlad.runtime import processes
 from colmap_netvlad.runtime.jobs import (
     LIGHT,
     Capacity,
@@ -22,9 +23,8 @@ from colmap_netvlad.runtime.jobs import (
     Shares,
     Source,
 )
-from colmap_netvlad.runtime.processes import Processes
 
-HERE = Processes()
+HERE = processes.Processes()
 
 _engine: Engine = HERE
 
@@ -97,6 +97,9 @@ def results(
     Raises:
         InputError: a process crashed or was killed. What a share raises is raised here. Either
             ends the work; results that were ready come first.
+
+    After an exception in this process (Ctrl-C), or when no more results are asked for, shares at
+    work here are waited for: long ones look at `unwanted` now and then, and stop.
     """
     shares = Shares(items, first, seconds)
     return _engine.results(function, shares, workers, initialiser, source, load)
@@ -117,3 +120,8 @@ def stream(
     Arguments and what is raised are as in `results`.
     """
     return _engine.stream(function, items, first, initialiser, source, load)
+
+
+def unwanted() -> bool:
+    """Return whether this process is at a share whose result nobody waits for any longer."""
+    return processes.unwanted()
