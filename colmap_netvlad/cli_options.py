@@ -248,7 +248,7 @@ MATCHER: tuple[Callable[[Any], Any], ...] = (
         "--thorough",
         is_flag=True,
         help="Let guided search pairs in full whose glance shows nothing in common, instead of"
-        " giving them up.",
+        " giving them up, and pairs again that earlier runs left without a match.",
     ),
 )
 

@@ -144,6 +144,21 @@ def test_thorough_gives_no_pair_up(
     assert report.verified >= verified_without_the_first(unbroken[1])
 
 
+def test_thorough_tries_pairs_given_up_before_again(project_copy: MakeProject) -> None:
+    database = project_copy().database
+    make_strange(database, 1)
+    pairs = all_pairs(database, 4)
+    match_pairs(database, pairs, GUIDED)
+    empty = sum(row[2] is None for row in rows(database).values())
+    report = match_pairs(database, pairs, THOROUGH)
+    assert (report.already, report.matched, report.given_up) == (6 - empty, empty, 0)
+    assert empty >= 3
+    found = rows(database)
+    change(database, "DELETE FROM matches", "DELETE FROM two_view_geometries")
+    match_pairs(database, pairs, THOROUGH)
+    assert rows(database) == found
+
+
 def test_rounds_count_the_pairs_given_up(project_copy: MakeProject) -> None:
     project = project_copy()
     make_strange(project.database, 1)

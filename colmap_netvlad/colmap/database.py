@@ -242,6 +242,11 @@ class Database:
         known = self._image_ids()
         return {pair for (found,) in rows if known.issuperset(pair := images_of_pair(found))}
 
+    def pairs_without_matches(self) -> set[tuple[int, int]]:
+        """Return the pairs that were tried and have no match at all."""
+        rows = self.connection.execute("SELECT pair_id FROM matches WHERE rows = 0")
+        return {images_of_pair(found) for (found,) in rows}
+
     def verified_matches(self) -> dict[tuple[int, int], int]:
         """Return the number of verified (inlier) matches by pair of image ids, lower first.
 

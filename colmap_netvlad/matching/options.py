@@ -16,7 +16,8 @@ class MatchOptions:
 
     Attributes:
         matcher: name in `matchers.MATCHERS`; None: `MATCHER_DEFAULT`.
-        thorough: the matcher `guided` searches pairs in full that it would give up.
+        thorough: the matcher `guided` searches pairs in full that it would give up, and tries
+            those again that were left without a match.
         seed: seed of the robust estimation, so that a pair always gives the same inliers.
         processes: how many work at once; None: all processors.
     """

@@ -47,6 +47,8 @@ def match_pairs(
         ids = {row.name: row.image_id for row in colmap.images()}
         keypoints, descriptors = colmap.keypoint_counts(), colmap.descriptor_counts()
         done = colmap.matched_pairs()
+        if options.thorough:
+            done -= colmap.pairs_without_matches()  # those given up before among them
         matcher, note = usable_matcher(options, colmap.has_sift())
         check_same_features(
             colmap, {_sorted_ids(ids[a], ids[b]) for a, b in pairs if {a, b} <= ids.keys()} & done
