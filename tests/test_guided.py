@@ -28,7 +28,7 @@ from colmap_netvlad.colmap.database import image_names, images_of_pair, open_dat
 from colmap_netvlad.colmap.results import PairResult, camera_of, write_results
 from colmap_netvlad.matching import blocks
 from colmap_netvlad.matching.features import prepare
-from colmap_netvlad.matching.guided import match
+from colmap_netvlad.matching.guided import Stage, match
 from colmap_netvlad.matching.matchers import MATCHERS, find_matcher
 from colmap_netvlad.matching.options import MatchOptions, MatchReport
 from colmap_netvlad.matching.rounds import match_in_rounds
@@ -435,6 +435,40 @@ def test_match_takes_the_matcher(project_copy: MakeProject) -> None:
 
 def test_every_matcher_can_be_found() -> None:
     assert {find_matcher(MatchOptions(name)).name for name in MATCHERS} == set(MATCHERS)
+
+
+# The search near the place where a feature is expected
+
+
+def towards(start: NDArray[np.float64], end: NDArray[np.float64], angle: float) -> np.ndarray:
+    """Turn a unit vector towards another by an angle, rad."""
+    across = end - (end @ start) * start
+    return np.cos(angle) * start + np.sin(angle) * across / np.linalg.norm(across)
+
+
+@pytest.mark.parametrize("twin", [False, True])
+def test_a_match_must_be_distinct_from_features_far_away_too(twin: bool) -> None:
+    random = np.random.default_rng(0)
+    at = np.concatenate([[[100, 100]], random.uniform(0, 2000, (1500, 2)), [[1900, 1900]]])
+    shape = np.tile(np.float32([2.0, 0.0, 0.0, 2.0]), (len(at), 1))
+    drawn = random.random((len(at) + 2, 128)) ** 4
+    drawn /= np.linalg.norm(drawn, axis=1, keepdims=True)
+    descriptors, elsewhere = drawn[:-2], drawn[-2:]
+    moved = descriptors.copy()
+    moved[0] = towards(descriptors[0], elsewhere[0], 0.65)
+    if twin:
+        moved[-1] = towards(descriptors[0], elsewhere[1], 0.7)
+    one, other = (
+        prepare(
+            np.column_stack([at, shape]).astype(np.float32), np.rint(512 * rows).astype(np.uint8)
+        )
+        for rows in (descriptors, moved)
+    )
+    found = match(one, other)
+    assert found.stage is Stage.NARROW
+    pairs = set(map(tuple, found.matches.tolist()))
+    assert len(pairs) >= 1500 and {(i, i) for i in range(1, 1501)} <= pairs
+    assert ((0, 0) in pairs) != twin
 
 
 # Properties

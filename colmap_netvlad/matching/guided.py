@@ -46,14 +46,14 @@ SURE = 12.0
 """Strength from which on the search is narrowed. From 8 to 11 that lost 3 of 38 pairs that COLMAP
 verifies, from 11 on 2 of 151, both of 16 or 17 inliers and as weak in a full search."""
 
-CLEAR = 0.6
+CLEAR = 0.65
 """Ratio within a window below which a match is taken; from there up to COLMAP's 0.8 it must also
 pass among all features of both photos. A window holds about a tenth of them, so that its second
 best is further away: without that test a quarter more matches than COLMAP's come out, their
 residuals twice as large as those of the rest, and the model's error grows by a seventh. Below 0.6
 it drops 1 % of the matches over land, and would take as long again as above."""
 
-FEW = 45
+FEW = 30
 AGREED_RATIO = 0.82
 """Matches that pass up to which others are added: those of a window that pass in it alone, and of
 up to `AGREED_RATIO` those that agree with one of them. Without any, 1 to 5 of a hundred pairs that
