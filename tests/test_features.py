@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -238,3 +240,21 @@ def test_ids_follow_the_names_whatever_the_threads(flight: RenderedFlight, tmp_p
         assert one.images() == three.images()
         assert one.keypoint_counts() == three.keypoint_counts()
         assert one.feature_fingerprints() == three.feature_fingerprints()
+
+
+HOLDER = """
+import sqlite3, sys, time
+database = sqlite3.connect(sys.argv[1], isolation_level=None)
+database.execute("BEGIN IMMEDIATE")
+print("held", flush=True)
+time.sleep(0.3)
+"""
+
+
+def test_colmap_opens_a_database_that_another_process_holds_for_a_moment(tmp_path: Path) -> None:
+    database = tmp_path / "project.db"
+    engine.make_or_migrate(database)
+    holder = [sys.executable, "-c", HOLDER, database]
+    with subprocess.Popen(holder, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None and process.stdout.readline() == "held\n"
+        engine.make_or_migrate(database)

@@ -16,6 +16,7 @@ import signal
 import sqlite3
 import tempfile
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
 from functools import partial
@@ -34,6 +35,9 @@ FREE_BYTES = 64 * 2**20
 
 LOCK_SECONDS = 5.0
 """How long to wait for another process's lock before saying so."""
+
+OPENINGS, OPENING_SECONDS = 10, 0.1
+"""How often and after which pauses COLMAP is asked to open a database."""
 
 WATCH_SECONDS = 0.2
 
@@ -130,8 +134,31 @@ def make_or_migrate(database: Path) -> None:
         InputError: COLMAP cannot read it.
     """
     silence()
+    with opened(database):
+        pass
+
+
+@contextmanager
+def opened(database: Path) -> Iterator[pycolmap.Database]:
+    """Open a database as COLMAP does, and close it after the block.
+
+    COLMAP writes as it opens and does not wait for another process, so it is asked again.
+
+    Raises:
+        InputError: COLMAP cannot read it.
+    """
     with faults_said():
-        pycolmap.Database.open(database).close()
+        for _ in range(OPENINGS - 1):
+            with suppress(Exception):
+                colmap = pycolmap.Database.open(database)
+                break
+            time.sleep(OPENING_SECONDS)
+        else:
+            colmap = pycolmap.Database.open(database)
+    try:
+        yield colmap
+    finally:
+        colmap.close()
 
 
 @contextmanager
@@ -147,8 +174,9 @@ def faults_said() -> Iterator[None]:
         raise
     except Exception as fault:
         raise InputError(
-            f"COLMAP stopped: {' '.join(str(fault).split())} Where the database is damaged "
-            "(sqlite3's `PRAGMA integrity_check` says so), restore it from a copy."
+            f"COLMAP stopped: {' '.join(str(fault).split())} Where another program uses the "
+            "database, wait for it; where it is damaged (sqlite3's `PRAGMA integrity_check` says "
+            "so), restore it from a copy."
         ) from fault
 
 

@@ -197,11 +197,8 @@ def _in_database(
             "database_merger; image names stay and must differ), or import all photos into one "
             "with `colmap-netvlad features`."
         )
-    opened = pycolmap.Database.open(project.database)
-    try:
+    with engine.opened(project.database) as opened:
         model.transcribe_image_ids_to_database(opened)
-    finally:
-        opened.close()
     target.mkdir()
     model.write(target)
     return target

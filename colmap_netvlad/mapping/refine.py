@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
+from colmap_netvlad.colmap import engine
 from colmap_netvlad.mapping.merge import SubModel
 
 MIN_NUM_MATCHES = 15
@@ -27,12 +28,9 @@ MAX_REFINEMENTS = 3
 
 def load_cache(database: Path) -> pycolmap.DatabaseCache:
     """Load what mapping needs of a whole database."""
-    opened = pycolmap.Database.open(database)
-    try:
+    with engine.opened(database) as opened:
         options = pycolmap.DatabaseCacheOptions(min_num_matches=MIN_NUM_MATCHES)
         return pycolmap.DatabaseCache.create(opened, options)
-    finally:
-        opened.close()
 
 
 def rebuild(model: SubModel, cache: pycolmap.DatabaseCache) -> pycolmap.Reconstruction:
