@@ -83,7 +83,7 @@ def simulate_flight(
     with pycolmap.DatabaseTransaction(written):
         _write(rng, written, names, seen, rotations, centres, options)
         if options.gps is not None:
-            _write_priors(written, names, centres, options.gps, options.seed)
+            write_gps(written, names, centres, options.gps, options.seed)
     written.close()
     return dict(zip(names, centres, strict=True))
 
@@ -252,7 +252,7 @@ def _write(
         database.write_two_view_geometry(ids[i], ids[j], geometry)
 
 
-def _write_priors(
+def write_gps(
     database: pycolmap.Database,
     names: list[str],
     centres: NDArray[np.float64],
