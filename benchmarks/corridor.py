@@ -3,9 +3,10 @@
     python benchmarks/corridor.py [--noise 2 0.02] [--seeds 3] [--lines 3] [--photos 100]
     python benchmarks/corridor.py --rendered FOLDER --seeds 1
 
-A simulated flight (features and matches with noise, no photos), or one of rendered photos, their SIFT
-features and matches, with GPS of a stated noise is mapped incrementally and in parallel, without and
-with its positions in the adjustment, brought into the world, and held against its true camera centres.
+A simulated flight (features and matches with noise, no photos), or one of rendered photos, their
+SIFT features and matches, with GPS of a stated noise is mapped incrementally and in parallel,
+without and with its positions in the adjustment, brought into the world, and held against its true
+camera centres.
 """
 
 from __future__ import annotations
