@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,7 +16,14 @@ from PIL import Image
 from colmap_netvlad.cli import cli
 from colmap_netvlad.colmap.database import open_database
 from colmap_netvlad.commands.georegister import georegister_in_place
-from colmap_netvlad.demo.simulate import FOCAL, FRAME, SimulationOptions, simulate_flight
+from colmap_netvlad.demo.render import RenderedFlight
+from colmap_netvlad.demo.simulate import (
+    FOCAL,
+    FRAME,
+    SimulationOptions,
+    simulate_flight,
+    write_gps,
+)
 from colmap_netvlad.geo.georeference import read_frame
 from colmap_netvlad.geo.places import DEFAULT_DEVIATIONS, Places, find_deviations, find_places
 from colmap_netvlad.mapping.incremental import map_incremental
@@ -23,6 +31,7 @@ from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.mapping.parallel import map_parallel
 from colmap_netvlad.mapping.priors import PositionPriors, write_priors
 from colmap_netvlad.photos.accuracy import read_deviations
+from colmap_netvlad.project import Project
 
 RTK = 0.02
 CORRIDOR = SimulationOptions(lines=2, photos=30, features=150, partners=12, gps=RTK, focal_error=0)
@@ -68,6 +77,29 @@ def test_rtk_keeps_a_corridor_within_five_centimetres(
     assert abs(camera.params[0] / FOCAL - 1) < 2e-3
     assert corridor.database.read_bytes() == before
     assert [path.name for path in tmp_path.iterdir()] == ["in"]
+
+
+@pytest.mark.parametrize(("noise", "within"), [(2.0, 1.5 * 2.0), (RTK, 0.05)])
+def test_rendered_photos_lie_within_the_noise_of_their_gps(
+    noise: float,
+    within: float,
+    flight: RenderedFlight,
+    project_copy: Callable[..., Project],
+    tmp_path: Path,
+) -> None:
+    database = project_copy(matched=True).database
+    opened = pycolmap.Database.open(database)
+    with pycolmap.DatabaseTransaction(opened):
+        opened.clear_pose_priors()
+        write_gps(opened, list(flight.names), flight.centres, noise, seed=1)
+    opened.close()
+    places = find_places(flight.names, database, None)
+    priors = PositionPriors(places.names, places.metres, np.full(places.metres.shape, noise))
+    map_incremental(database, None, tmp_path / "in", MappingOptions(threads=1, priors=priors))
+    georegister_in_place(tmp_path / "in", places, adjusted=True)
+    truth = dict(zip(flight.names, flight.centres, strict=True))
+    error = errors(tmp_path / "in", Corridor(database, truth, places, priors))
+    assert np.sqrt((error**2).mean(axis=0)).max() < within
 
 
 def test_without_priors_in_the_adjustment_the_corridor_bends(
