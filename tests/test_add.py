@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
@@ -172,10 +172,10 @@ def test_without_a_model_it_is_one_sentence(project_copy: Callable[..., Project]
         add_photos(project, newest_model(project), OPTIONS)
 
 
-def test_a_stopped_addition_goes_on_with_the_same_photos(
-    reconstructed: tuple[Project, list[Path]], monkeypatch: pytest.MonkeyPatch
+def stop_an_addition(
+    project: Project, photos: Sequence[Path], step: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    project, photos = reconstructed
+    """Add photos, and press Ctrl-C where a step of it begins."""
     assert project.images is not None
     for photo in photos:
         shutil.copy(photo, project.images / photo.name)
@@ -184,9 +184,17 @@ def test_a_stopped_addition_goes_on_with_the_same_photos(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:
-        patched.setattr(add, "match_pairs", stop)  # the database has the new photos by then
+        patched.setattr(add, step, stop)
         with pytest.raises(KeyboardInterrupt):
-            add_photos(project, newest_model(project), OPTIONS)
+            add_photos(project, None, OPTIONS)
+
+
+def test_a_stopped_addition_goes_on_with_the_same_photos(
+    reconstructed: tuple[Project, list[Path]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    project, photos = reconstructed
+    # The database has the new photos by then.
+    stop_an_addition(project, photos, "match_pairs", monkeypatch)
     report = add_photos(project, newest_model(project), OPTIONS)
     assert report.new == sorted(photo.name for photo in photos)
     assert report.after.registered == report.before.registered + NEW
@@ -198,17 +206,7 @@ def test_an_addition_stopped_before_its_page_makes_no_other_model(
     reconstructed: tuple[Project, list[Path]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     project, photos = reconstructed
-    assert project.images is not None
-    for photo in photos:
-        shutil.copy(photo, project.images / photo.name)
-
-    def stop(*arguments: object) -> None:
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patched:
-        patched.setattr(add, "report_models", stop)
-        with pytest.raises(KeyboardInterrupt):
-            add_photos(project, None, OPTIONS)
+    stop_an_addition(project, photos, "report_models", monkeypatch)
     extended = project.folder / "sparse-2" / "0"
     made = (extended / "images.bin").read_bytes()
     assert newest_model(project) == extended and not (extended / "report.html").exists()
