@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
@@ -56,6 +57,25 @@ class Load:
 
 
 LIGHT = Load()
+
+
+def nothing() -> None:
+    """The initialiser of work that needs none."""
+
+
+@dataclass(frozen=True)
+class Work(Generic[Item, Result]):
+    """What is done with each share of many items; see `runtime.workers.results`."""
+
+    function: Callable[..., Result]
+    initialiser: Callable[[], None] = nothing
+    source: Source[Item] | None = None
+    load: Load = LIGHT
+
+    @property
+    def here(self) -> Callable[..., Result]:
+        """The function of a share, for who opens the source itself."""
+        return self.function if self.source is None else partial(self.function, self.source.path)
 
 
 @dataclass(frozen=True)
@@ -165,23 +185,11 @@ class Engine(Protocol):
     ) -> list[Outcome]: ...
 
     def results(
-        self,
-        function: Callable[..., Result],
-        shares: Shares[Item],
-        workers: int,
-        initialiser: Callable[[], None],
-        source: Source[Item] | None,
-        load: Load,
+        self, work: Work[Item, Result], shares: Shares[Item], workers: int
     ) -> Generator[Result, None, None]: ...
 
     def stream(
-        self,
-        function: Callable[..., Iterable[Result]],
-        items: Sequence[Item],
-        first: int,
-        initialiser: Callable[[], None],
-        source: Source[Item] | None,
-        load: Load,
+        self, work: Work[Item, Iterable[Result]], items: Sequence[Item], first: int
     ) -> Generator[Result, None, None]: ...
 
 

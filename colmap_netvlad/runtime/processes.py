@@ -13,7 +13,6 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor
 from concurrent.futures import wait as wait_for_any
 from concurrent.futures.process import BrokenProcessPool
-from functools import partial
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 from multiprocessing.synchronize import Event
@@ -25,11 +24,10 @@ from colmap_netvlad.runtime.jobs import (
     Capacity,
     Item,
     Job,
-    Load,
     Outcome,
     Result,
     Shares,
-    Source,
+    Work,
 )
 from colmap_netvlad.runtime.machine import usable_memory, usable_processors
 
@@ -100,26 +98,19 @@ class Processes:
         return outcomes
 
     def results(
-        self,
-        function: Callable[..., Result],
-        shares: Shares[Item],
-        workers: int,
-        initialiser: Callable[[], None],
-        source: Source[Item] | None,
-        load: Load,
+        self, work: Work[Item, Result], shares: Shares[Item], workers: int
     ) -> Generator[Result, None, None]:
         """Work at shares in a pool of processes."""
-        called = function if source is None else partial(function, source.path)
         context = multiprocessing.get_context("spawn")
         stop = context.Event()
-        pool = ProcessPoolExecutor(workers, context, _begin_shares, (stop, initialiser))
+        pool = ProcessPoolExecutor(workers, context, _begin_shares, (stop, work.initialiser))
         running: dict[Future[tuple[float, Result]], int] = {}
         try:
             while shares or running:
                 with _heard_later():  # the first share starts all processes
                     while shares and len(running) < AHEAD * workers:
                         share = shares.next(workers)
-                        running[pool.submit(_timed, called, share)] = len(share)
+                        running[pool.submit(_timed, work.here, share)] = len(share)
                 done, _ = wait_for_any(running, return_when=FIRST_COMPLETED)
                 for ended in sorted(done, key=lambda ended: ended.exception() is not None):
                     seconds, result = ended.result()
@@ -135,17 +126,10 @@ class Processes:
             pool.shutdown(cancel_futures=True)
 
     def stream(
-        self,
-        function: Callable[..., Iterable[Result]],
-        items: Sequence[Item],
-        first: int,
-        initialiser: Callable[[], None],
-        source: Source[Item] | None,
-        load: Load,
+        self, work: Work[Item, Iterable[Result]], items: Sequence[Item], first: int
     ) -> Generator[Result, None, None]:
         """Work at all items in this process."""
-        called = function if source is None else partial(function, source.path)
-        yield from called(items)
+        yield from work.here(items)
 
 
 @contextlib.contextmanager
@@ -178,7 +162,8 @@ def _timed(function: Callable[..., Result], share: Sequence[Item]) -> tuple[floa
 def _outcome(process: SpawnProcess, receiver: Connection) -> Outcome:
     with contextlib.suppress(EOFError), receiver:
         if receiver.poll():
-            return Outcome(*receiver.recv())
+            outcome: Outcome = receiver.recv()
+            return outcome
     code = process.exitcode or 0
     if code == -KILLED:
         return Outcome("its process was killed, by the system for want of memory perhaps")
@@ -192,15 +177,23 @@ def _work(job: Job, counter: Any, sender: Connection, initialiser: Callable[[], 
         with counter.get_lock():
             counter.value += count
 
-    fault, start = None, time.monotonic()
-    try:
+    def do() -> None:
         initialiser()
         job.function(advance, *job.files, *job.arguments)
+
+    sender.send(outcome_of(do))
+
+
+def outcome_of(do: Callable[[], None]) -> Outcome:
+    """Do a job in this process, and return how it ended."""
+    fault, start = None, time.monotonic()
+    try:
+        do()
     except InputError as known:
         fault = known.message
     except Exception as unknown:
         fault = f"{type(unknown).__name__}: {unknown}"
-    sender.send((fault, peak_bytes(), time.monotonic() - start))
+    return Outcome(fault, peak_bytes(), time.monotonic() - start)
 
 
 _stop: Event | None = None

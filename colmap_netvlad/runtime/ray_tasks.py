@@ -37,8 +37,9 @@ from colmap_netvlad.runtime.jobs import (
     Result,
     Shares,
     Source,
+    Work,
 )
-from colmap_netvlad.runtime.processes import peak_bytes
+from colmap_netvlad.runtime.processes import outcome_of
 from colmap_netvlad.runtime.version import VERSION
 
 TASK_SECONDS = 30.0
@@ -109,23 +110,19 @@ class RayTasks:
 
     def capacity(self) -> Capacity:
         """Return what the machines offer."""
-        machines = [resources.get("CPU", 0) for resources in _machines()]
-        memory = sum(resources.get("memory", 0) for resources in _machines())
-        return Capacity(max(1, int(sum(machines))), memory, max(1, int(max(machines, default=1))))
+        machines = _machines()
+        processors = [resources.get("CPU", 0) for resources in machines]
+        memory = sum(resources.get("memory", 0) for resources in machines)
+        most = max(processors, default=1)
+        return Capacity(max(1, int(sum(processors))), memory, max(1, int(most)))
 
     def results(
-        self,
-        function: Callable[..., Result],
-        shares: Shares[Item],
-        workers: int,
-        initialiser: Callable[[], None],
-        source: Source[Item] | None,
-        load: Load,
+        self, work: Work[Item, Result], shares: Shares[Item], workers: int
     ) -> Generator[Result, None, None]:
         """Work at each share in a task."""
         shares.lengthen(TASK_SECONDS)
-        load = _fitting(load)
-        order = Order(function, initialiser, source.take if source else None, load)
+        source, load = work.source, _fitting(work.load)
+        order = Order(work.function, work.initialiser, source.take if source else None, load)
         with contextlib.closing(_tasks(order, _calls(shares, source, load))) as tasks:
             for call, done in tasks:
                 if isinstance(done, Exception):
@@ -136,20 +133,12 @@ class RayTasks:
                 yield done.value
 
     def stream(
-        self,
-        function: Callable[..., Iterable[Result]],
-        items: Sequence[Item],
-        first: int,
-        initialiser: Callable[[], None],
-        source: Source[Item] | None,
-        load: Load,
+        self, work: Work[Item, Iterable[Result]], items: Sequence[Item], first: int
     ) -> Generator[Result, None, None]:
         """Work at each share in a task."""
         shares = Shares(items, first, TASK_SECONDS)
-        listed = partial(_listed, function)
-        with contextlib.closing(
-            self.results(listed, shares, 0, initialiser, source, load)
-        ) as results:
+        listed = Work(partial(_listed, work.function), work.initialiser, work.source, work.load)
+        with contextlib.closing(self.results(listed, shares, 0)) as results:
             for result in results:
                 yield from result
 
@@ -363,16 +352,9 @@ def _do_job(part: Path, share: Sequence[Any]) -> JobDone:
         nonlocal units
         units += count
 
-    start, fault = time.monotonic(), None
     with scratch_folder() as folder:
-        try:
-            function(advance, part, folder, *arguments)
-        except InputError as known:
-            fault = known.message
-        except Exception as unknown:
-            fault = f"{type(unknown).__name__}: {unknown}"
-        outcome = Outcome(fault, peak_bytes(), time.monotonic() - start)
-        return JobDone(outcome, units, {} if fault else _read_files(folder))
+        outcome = outcome_of(partial(function, advance, part, folder, *arguments))
+        return JobDone(outcome, units, {} if outcome.fault else _read_files(folder))
 
 
 def _read_files(folder: Path) -> dict[str, bytes]:

@@ -22,6 +22,8 @@ from colmap_netvlad.runtime.jobs import (
     Result,
     Shares,
     Source,
+    Work,
+    nothing,
 )
 
 HERE = processes.Processes()
@@ -40,10 +42,6 @@ def using(engine: Engine) -> Iterator[None]:
         _engine = before
 
 
-def _nothing() -> None:
-    pass
-
-
 def capacity() -> Capacity:
     """Return what there is to work with."""
     return _engine.capacity()
@@ -54,7 +52,7 @@ def run(
     workers: int,
     advance: Callable[[int], None],
     finished: Callable[[int, Outcome], None] = lambda number, outcome: None,
-    initialiser: Callable[[], None] = _nothing,
+    initialiser: Callable[[], None] = nothing,
 ) -> list[Outcome]:
     """Run jobs, at most `workers` at a time, and return how each ended.
 
@@ -76,7 +74,7 @@ def results(
     function: Callable[..., Result],
     items: Sequence[Item],
     workers: int,
-    initialiser: Callable[[], None] = _nothing,
+    initialiser: Callable[[], None] = nothing,
     source: Source[Item] | None = None,
     load: Load = LIGHT,
     *,
@@ -102,13 +100,13 @@ def results(
     work here are waited for: long ones look at `unwanted` now and then, and stop.
     """
     shares = Shares(items, first, seconds)
-    return _engine.results(function, shares, workers, initialiser, source, load)
+    return _engine.results(Work(function, initialiser, source, load), shares, workers)
 
 
 def stream(
     function: Callable[..., Iterable[Result]],
     items: Sequence[Item],
-    initialiser: Callable[[], None] = _nothing,
+    initialiser: Callable[[], None] = nothing,
     source: Source[Item] | None = None,
     load: Load = LIGHT,
     *,
@@ -119,7 +117,7 @@ def stream(
     On this machine all items are one share, in this process; other machines take shares of them.
     Arguments and what is raised are as in `results`.
     """
-    return _engine.stream(function, items, first, initialiser, source, load)
+    return _engine.stream(Work(function, initialiser, source, load), items, first)
 
 
 def unwanted() -> bool:
