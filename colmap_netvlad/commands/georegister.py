@@ -24,7 +24,7 @@ from colmap_netvlad.geo.gcp import (
 from colmap_netvlad.geo.georeference import Georeference, read_place, transformed
 from colmap_netvlad.geo.places import Places, find_places
 from colmap_netvlad.mapping.merge import Refused, read_sub_model, shared_points, similarity
-from colmap_netvlad.mapping.output import free_output, model_folder
+from colmap_netvlad.mapping.output import free_output, model_folder, numbered
 from colmap_netvlad.project import DATABASE_NAMES
 from colmap_netvlad.runtime.errors import InputError
 from colmap_netvlad.runtime.files import temporary_prefix
@@ -339,9 +339,9 @@ def find_models(sparse: Path) -> list[Path]:
     if _is_model(sparse):
         return [sparse]
     if sparse.is_dir():
-        found = [path for path in sparse.iterdir() if path.name.isdigit() and _is_model(path)]
+        found = [path for path in numbered(sparse) if _is_model(path)]
         if found:
-            return sorted(found, key=lambda path: int(path.name))
+            return found
     raise InputError(
         f"{sparse} holds no COLMAP model (cameras, images, points3D); name one as `sparse`."
     )

@@ -10,7 +10,7 @@ import pycolmap
 from colmap_netvlad.colmap import engine
 from colmap_netvlad.mapping.incremental import pipeline_options
 from colmap_netvlad.mapping.options import MappingOptions
-from colmap_netvlad.mapping.output import Finish, as_mapped, model_folder
+from colmap_netvlad.mapping.output import Finish, as_mapped, model_folder, numbered
 from colmap_netvlad.mapping.priors import with_priors
 from colmap_netvlad.runtime import progress
 from colmap_netvlad.runtime.errors import InputError
@@ -36,8 +36,7 @@ def read_models(output: Path) -> list[pycolmap.Reconstruction]:
     Raises:
         InputError: one of them cannot be read.
     """
-    folders = [folder for folder in output.iterdir() if folder.name.isdigit()]
-    return [read_model(folder) for folder in sorted(folders, key=lambda path: int(path.name))]
+    return [read_model(folder) for folder in numbered(output)]
 
 
 def largest_model(folders: Sequence[Path]) -> Path:

@@ -47,6 +47,12 @@ def model_folder(output: Path) -> Iterator[Path]:
         shutil.rmtree(temporary, ignore_errors=True)
 
 
+def numbered(folder: Path) -> list[Path]:
+    """Return the folders `folder`/0, 1, ..., in the order of their numbers."""
+    found = (path for path in folder.iterdir() if path.name.isdigit())
+    return sorted(found, key=lambda path: int(path.name))
+
+
 def outputs(output: Path) -> list[Path]:
     """Return `output`, `<output>-2`, `-3`, ... as far as they hold something, the newest last."""
     found, candidate = [], output

@@ -26,7 +26,7 @@ from colmap_netvlad.graph.viewgraph import ViewGraph, read_view_graph
 from colmap_netvlad.mapping.incremental import pipeline_options
 from colmap_netvlad.mapping.merge import merge, read_sub_model
 from colmap_netvlad.mapping.options import MappingOptions
-from colmap_netvlad.mapping.output import Finish, as_mapped, model_folder
+from colmap_netvlad.mapping.output import Finish, as_mapped, model_folder, numbered
 from colmap_netvlad.mapping.partition import Cluster, partition
 from colmap_netvlad.mapping.priors import with_priors, write_priors
 from colmap_netvlad.mapping.refine import load_cache, rebuild, refine
@@ -141,7 +141,7 @@ def reconstruct_parallel(
         state = open_state(output, graph, clusters, options)
         report = map_clusters(database, clusters, state, options)
         merge_clusters(database, images, state, folder, options, report)
-        models = [pycolmap.Reconstruction(path) for path in _numbered(folder)]
+        models = [pycolmap.Reconstruction(path) for path in numbered(folder)]
         finish(folder)
     forget_clusters(output)
     return models, report
@@ -296,7 +296,7 @@ def merge_clusters(
     Raises:
         InputError: the worker failed.
     """
-    finished = {path: _numbered(path) for path in _numbered(state)}
+    finished = {path: numbered(path) for path in numbered(state)}
     for path, models in finished.items():
         report.clusters[int(path.name)].models = [_registered(model) for model in models]
     with progress.step("Merging and adjusting (%)", 100) as bar:
@@ -407,12 +407,6 @@ def _image_count(database: Path) -> int:
 
 def _state(output: Path) -> Path:
     return output.parent / f".{output.name}.clusters"
-
-
-def _numbered(folder: Path) -> list[Path]:
-    return sorted(
-        (path for path in folder.iterdir() if path.name.isdigit()), key=lambda path: int(path.name)
-    )
 
 
 def _registered(model: Path) -> int:
