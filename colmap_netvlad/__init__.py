@@ -12,7 +12,7 @@ Each name below is one step; nothing is imported before it is used.
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from colmap_netvlad.runtime.libraries import keep_zlib_apart
+from colmap_netvlad.runtime.libraries import keep_zlib_apart, wait_without_spinning
 from colmap_netvlad.runtime.version import VERSION
 
 if TYPE_CHECKING:
@@ -62,6 +62,7 @@ _HOMES = {
 }
 """Where each public name lives (PEP 562: looked up when it is first used)."""
 
+wait_without_spinning()
 keep_zlib_apart()
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -64,6 +65,24 @@ def test_the_face_is_small_and_loads_nothing_by_itself() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only GNU's OpenMP prints what it heeds")
+@pytest.mark.parametrize(
+    ("wanted", "heeded"), [({}, "PASSIVE"), ({"OMP_WAIT_POLICY": "ACTIVE"}, "ACTIVE")]
+)
+def test_torch_s_threads_sleep_where_they_wait_unless_told_otherwise(
+    wanted: dict[str, str], heeded: str
+) -> None:
+    others = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
+    done = subprocess.run(
+        [sys.executable, "-c", "import colmap_netvlad, torch"],
+        env={**others, "OMP_DISPLAY_ENV": "TRUE", **wanted},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert f"OMP_WAIT_POLICY = '{heeded}'" in done.stderr
 
 
 @pytest.mark.parametrize("first", ["pycolmap", "colmap_netvlad"])
