@@ -21,6 +21,7 @@ from colmap_netvlad.cli_options import (
     FOLDER,
     PATH,
     cluster_option,
+    contradicted_option,
     database_option,
     device_option,
     feature_options,
@@ -269,11 +270,7 @@ def match(
     " where there are models already]",
 )
 @mapping_options
-@click.option(
-    "--drop-contradicted",
-    is_flag=True,
-    help="Leave out pairs of look-alike places: what the pairs around them or GPS contradict.",
-)
+@contradicted_option
 @place_options
 @ground_options
 @matching_options
@@ -339,6 +336,7 @@ def reconstruct(
 @method_option
 @retrieval_options
 @matcher_options
+@contradicted_option
 @feature_options
 @verbose_option
 def add(
@@ -350,6 +348,7 @@ def add(
     method: str,
     retrieval: RetrievalOptions,
     matching: MatchOptions,
+    drop_contradicted: bool,
     features: FeatureOptions,
 ) -> None:
     """Register new photos into an existing model.
@@ -368,6 +367,7 @@ def add(
         replace(features, masks=retrieval.masks),
         retrieval.seed,
         matching,
+        drop_contradicted,
         given_command(),
     )
     report = add_photos(project, sparse, options, output)

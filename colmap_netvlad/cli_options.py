@@ -101,6 +101,13 @@ copy_option = click.option(
     is_flag=True,
     help="Leave the database as it is and write matches into <name>.copy.db beside it.",
 )
+contradicted_option = click.option(
+    "--drop-contradicted/--keep-contradicted",
+    default=True,
+    show_default=True,
+    help="Leave out of the mapping pairs of look-alike places: what the pairs around them or GPS"
+    " contradict.",
+)
 json_option = click.option(
     "--json", "as_json", is_flag=True, help="Print the report as JSON on standard output."
 )

@@ -12,7 +12,6 @@ from click.testing import CliRunner
 
 from colmap_netvlad.cli import cli
 from colmap_netvlad.colmap.database import image_names, open_database, pair_id
-from colmap_netvlad.commands.reconstruct import contradicted_pairs
 from colmap_netvlad.demo.landscape import ESTATE_STEP, Extent, Landscape
 from colmap_netvlad.demo.simulate import FLYING_HEIGHT, SimulationOptions, simulate_flight
 from colmap_netvlad.graph.lookalikes import (
@@ -24,6 +23,7 @@ from colmap_netvlad.graph.lookalikes import (
 )
 from colmap_netvlad.graph.pair import as_pair
 from colmap_netvlad.graph.verified import verified_by_name
+from colmap_netvlad.mapping.contradicted import contradicted_pairs
 
 WIDTH = 1.25
 
@@ -94,6 +94,18 @@ def test_gps_finds_them_and_decides_alone(seed):
     found = judge_moves(moves, metres)
     assert {one.pair for one in found} == pairs_of(moves, wrong)
     assert all("m apart, GPS" in one.reason for one in found)
+
+
+def test_photos_with_a_wild_position_keep_their_pairs():
+    moves, metres, wrong = flight_moves(filled=1.0)
+    wild = {**metres, moves.names[10]: metres[moves.names[10]] + (900.0, -400.0, 0.0)}
+    wild[moves.names[30]] = np.array([0.0, 5000.0, 90.0])
+    own = {
+        as_pair(*(moves.names[k] for k in edge))
+        for edge in moves.edges.tolist()
+        if {10, 30} & {*edge}
+    }
+    assert {one.pair for one in judge_moves(moves, wild)} == pairs_of(moves, wrong) - own
 
 
 def test_a_pair_that_lacks_nothing_is_not_contradicted():
@@ -190,11 +202,9 @@ def test_dropped_pairs_stay_in_the_database_and_out_of_the_model(project_copy, f
     assert contradicted_pairs(project) == [pair]
     before = verified_by_name(project.database)
     project.pairs.write_text("".join(f"{a} {b}\n" for a in names for b in names if a < b))
-    run = CliRunner().invoke(
-        cli, ["reconstruct", "--db", str(project.database), "--drop-contradicted"]
-    )
+    run = CliRunner().invoke(cli, ["reconstruct", "--db", str(project.database)])
     assert run.exit_code == 0, run.output
-    assert "Look-alikes: 1 contradicted pairs were left out" in run.stdout
+    assert "Look-alikes: 1 contradicted pair was left out" in run.stdout
     assert verified_by_name(project.database) == before and before[pair] > 40
     assert not list(project.folder.glob(".lookalikes*"))
     page = (project.sparse / "0" / "report.html").read_text("utf-8")

@@ -25,6 +25,8 @@ from colmap_netvlad.commands.report import (
 )
 from colmap_netvlad.geo.georeference import Place, read_place
 from colmap_netvlad.geo.places import find_deviations, find_places
+from colmap_netvlad.graph.pair import Pair
+from colmap_netvlad.mapping.contradicted import dropped_lines, mapping_database
 from colmap_netvlad.mapping.extend import extend_model, largest_model, read_model
 from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.mapping.output import free_output
@@ -67,6 +69,7 @@ class AddOptions:
         features: how the new photos are imported.
         seed: of matching and mapping.
         matching: who matches; its seed is set from here.
+        drop_contradicted: leave pairs of look-alike places out of the mapping.
         command: the command line that asked for it, for the quality report.
     """
 
@@ -76,6 +79,7 @@ class AddOptions:
     features: FeatureOptions = field(default_factory=FeatureOptions)
     seed: int = 0
     matching: MatchOptions = field(default_factory=MatchOptions)
+    drop_contradicted: bool = True
     command: str = ""
 
 
@@ -93,6 +97,7 @@ class AddReport:
         seconds: duration by stage, s.
         quality: the extended model's quality report.
         placed: where it is in the world; None where the model given was nowhere.
+        dropped: contradicted pairs that were left out of the mapping.
     """
 
     new: list[str]
@@ -105,6 +110,7 @@ class AddReport:
     seconds: dict[str, float]
     quality: list[FlightReport] = field(default_factory=list)
     placed: Placed | None = None
+    dropped: list[Pair] = field(default_factory=list)
 
 
 def add_photos(
@@ -163,6 +169,7 @@ def add_photos(
     with open_database(project.database) as database:
         run = replace(run, source=database.verified_fingerprint())
 
+    dropped: list[Pair] = []
     place, placed = read_place(model), None
     priors = _priors(project, place) if place is not None and place.adjusted else None
 
@@ -173,7 +180,7 @@ def add_photos(
             adjusted = priors is not None
             placed = keep_place(model, models / "0", project.database, folder, adjusted=adjusted)
         seconds["mapping"] = time.monotonic() - start
-        save_runs(models, replace(run, seconds=seconds))
+        save_runs(models, replace(run, seconds=seconds, dropped=len(dropped)))
 
     target = made_before(output or project.sparse, run) if begun.photos else None
     if target is not None:
@@ -182,7 +189,8 @@ def add_photos(
     else:
         target = free_output(output or project.sparse)
         mapping = MappingOptions(seed=options.seed, priors=priors)
-        after = extend_model(project.database, folder, model, target, len(usable), mapping, finish)
+        with mapping_database(project, options.drop_contradicted) as (kept, dropped):
+            after = extend_model(kept, folder, model, target, len(usable), mapping, finish)
     quality = report_models(target, project.database, folder)
     registered = registered_names([after])
     _remember(project, Begun())
@@ -197,6 +205,7 @@ def add_photos(
         seconds=seconds,
         quality=quality,
         placed=placed,
+        dropped=dropped,
     )
 
 
@@ -228,6 +237,7 @@ def add_lines(report: AddReport) -> list[str]:
             f"Not registered: {listed(report.unregistered)}; photos that overlap only other "
             "new ones need `among_new`, or new pairs and a new model."
         )
+    lines += dropped_lines(report.dropped)
     if report.placed is not None:
         lines += report.placed.lines()
     return [*lines, f"The extended model is in {report.output}."]

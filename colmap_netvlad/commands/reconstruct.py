@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from colmap_netvlad.colmap.copies import copy_with_pairs
 from colmap_netvlad.colmap.database import image_names, open_database
 from colmap_netvlad.commands.georegister import (
     Placed,
@@ -36,14 +33,12 @@ from colmap_netvlad.commands.report import (
     run_of,
     save_runs,
 )
-from colmap_netvlad.flight import open_flight
 from colmap_netvlad.geo.align import MIN_PLACES
 from colmap_netvlad.geo.gcp import ControlList
 from colmap_netvlad.geo.places import Places, find_deviations, find_places
-from colmap_netvlad.graph.lookalikes import find_lookalikes
 from colmap_netvlad.graph.pair import Pair
-from colmap_netvlad.graph.verified import verified_by_name
 from colmap_netvlad.mapping import MAPPERS, WITH_PRIORS
+from colmap_netvlad.mapping.contradicted import dropped_lines, mapping_database
 from colmap_netvlad.mapping.extend import read_models
 from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.mapping.output import free_output
@@ -54,7 +49,6 @@ from colmap_netvlad.matching.options import MatchOptions, given_up_words
 from colmap_netvlad.matching.rounds import rounds_lines
 from colmap_netvlad.project import Project
 from colmap_netvlad.runtime.errors import InputError
-from colmap_netvlad.runtime.files import scratch_folder
 from colmap_netvlad.runtime.sequences import listed
 
 
@@ -66,7 +60,7 @@ class ReconstructOptions:
         mapper: name in `mapping.MAPPERS`.
         mapping: what the mapper is told.
         matching: how pairs are matched.
-        drop_contradicted: leave pairs that look like look-alikes out of the mapping.
+        drop_contradicted: leave pairs of look-alike places out of the mapping.
         command: the command line that asked for it, for the quality report.
         world: how models are brought into the world.
     """
@@ -75,7 +69,7 @@ class ReconstructOptions:
     mapping: MappingOptions = MappingOptions()
     matching: MatchOptions = MatchOptions()
     world: WorldOptions = WorldOptions()
-    drop_contradicted: bool = False
+    drop_contradicted: bool = True
     command: str = ""
 
 
@@ -214,38 +208,6 @@ def _mapped_from(project: Project, places: Places | None, world: WorldOptions) -
     return digest.hexdigest()
 
 
-@contextmanager
-def mapping_database(project: Project, drop: bool) -> Iterator[tuple[Path, list[Pair]]]:
-    """Yield the database to map from, and the pairs it lacks.
-
-    Where contradicted pairs are to be dropped it is a copy without them, gone after the block:
-    the project's database keeps every match.
-    """
-    dropped = contradicted_pairs(project) if drop else []
-    if not dropped:
-        yield project.database, []
-        return
-    left_out = set(dropped)
-    kept = [pair for pair in verified_by_name(project.database) if pair not in left_out]
-    with scratch_folder(project.folder) as folder:
-        copy = folder / project.database.name
-        copy_with_pairs(project.database, copy, kept)
-        yield copy, dropped
-
-
-def contradicted_pairs(project: Project) -> list[Pair]:
-    """Return the verified pairs that the pairs around them or GPS contradict.
-
-    Raises:
-        InputError: the database cannot be read.
-    """
-    with open_flight(project) as flight:
-        metres = flight.positions.metres
-        positions = dict(zip(flight.names, metres, strict=True))
-        found = find_lookalikes(flight.database, positions)
-    return [one.pair for one in found if one.contradicted]
-
-
 def _known_places(
     project: Project, world: WorldOptions
 ) -> tuple[ControlList | None, Places | None]:
@@ -311,10 +273,7 @@ def report_lines(report: ReconstructReport) -> list[str]:
         + f", together {sum(report.seconds.values()) / 60:.1f}.",
         *view_graph_lines(matching.components),
     ]
-    if report.dropped:
-        lines.append(
-            f"Look-alikes: {len(report.dropped):,} contradicted pairs were left out of the mapping."
-        )
+    lines += dropped_lines(report.dropped)
     for number, placed in enumerate(report.placed):
         where = f"Model {number}: " if len(report.placed) > 1 else ""
         lines += [where + line for line in placed.lines()]

@@ -8,7 +8,8 @@ similarity of the plane. All pairs together must agree on one plan:
 
 - **cycles**: the plan is fitted to all pairs robustly; a pair that lies far beside the plan that
   the others agree on is contradicted by the cycles it closes.
-- **GPS**: a pair whose matches say "12 m apart" where GPS says 85 m is contradicted.
+- **GPS**: a pair whose matches say "12 m apart" where GPS says 85 m is contradicted, unless the
+  plan shows that the position of one of its photos is what is wrong.
 
 A look-alike betrays itself by what it lacks, too: around the copy lies other ground, where both
 photos have matches with their true neighbours but none with each other (Zach, Irschara and
@@ -338,7 +339,7 @@ def find_lookalikes(
 
     Args:
         positions: known positions by image name: east, north, up, m. Where both photos of a pair
-            have one, GPS decides alone, as it does not drift.
+            have one that fits the plan, GPS decides alone, as it does not drift.
     """
     moves = read_moves(database)
     return judge_moves(moves, positions or {})
@@ -411,9 +412,28 @@ def _against_gps(
     matched = metre * moved
     limit = np.maximum(GPS_ERROR, BESIDE * metre * size * moves.widths[j])
     limit = np.where(usable, limit, np.nan)
-    if not _agreed(moves, np.abs(matched - known) / limit):
+    over = np.abs(matched - known) / limit
+    if not _agreed(moves, over):
         return _Distances(nothing, nothing, nothing)
-    return _Distances(matched, known, limit)
+    wild = _wild_positions(moves, plan, over)
+    return _Distances(matched, known, np.where(wild[i] | wild[j], np.nan, limit))
+
+
+def _wild_positions(moves: Moves, plan: Plan, over: Floats) -> NDArray[np.bool_]:
+    """Return (N) which photos have a wrong position rather than wrong pairs.
+
+    More of their pairs that fit the plan are contradicted by GPS than not.
+
+    Args:
+        over: (E) difference of the distances over its limit; NaN where it is not judged.
+    """
+    fitting = np.isfinite(over) & (plan.beside <= BESIDE)
+    count = len(moves.names)
+    against, for_it = (
+        np.bincount(moves.edges[fitting & side].ravel(), minlength=count)
+        for side in (over > 1, over <= 1)
+    )
+    return np.asarray(against > for_it)
 
 
 def _agreed(moves: Moves, over: Floats) -> bool:

@@ -411,7 +411,7 @@ def _lookalikes(quality: Quality) -> Check | None:
     return Check(
         title, value, "yellow",
         "Verified pairs of what are probably different places; they can fold a model. Look at them "
-        "below; `drop_contradicted` of reconstruct leaves them out.",
+        "below; `reconstruct` leaves them out unless it is told to keep them.",
     )  # fmt: skip
 
 
