@@ -257,7 +257,7 @@ def driver(scene: str, images: int, pairs: tuple[int, ...]) -> None:
 
         for count in pairs:
             share = near[:count]
-            part = partial(_part, Call(share, partial(part_of_pairs, source, share)))
+            part = partial(_part, Call(share, partial(part_of_pairs, source)))
             report = match_block(Photos(), source, MatchOptions("guided"), share)
             row("match, guided", len(share), part, report.results, partial(write_results, source))
             row(
@@ -268,12 +268,12 @@ def driver(scene: str, images: int, pairs: tuple[int, ...]) -> None:
                 partial(write_rows, source),
             )
         parts = PartsOfImport(source, names)
-        part = partial(_part, Call(names, partial(parts.part, source, names)))
+        part = partial(_part, Call(names, partial(parts.part, source)))
         features = read_rows(source, dict.fromkeys(FEATURES, ("image_id", ids)))
         row("features", len(names), part, features, partial(write_rows, source))
         described = list(
             _describe_share(
-                Enclosed(CATALOGUE[DEFAULT].file()), Path(photos), RetrievalOptions(), names
+                Enclosed(CATALOGUE[DEFAULT].file()), RetrievalOptions(), Path(photos), None, names
             )
         )
         with Store(Path(scratch, "cache.db")) as store:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
 import socket
@@ -11,10 +12,12 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing
+from contextlib import closing, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pycolmap
 import pytest
@@ -32,10 +35,12 @@ from colmap_netvlad.matching import blocks
 from colmap_netvlad.matching import colmap as matching
 from colmap_netvlad.matching.options import MatchOptions
 from colmap_netvlad.matching.run import match_pairs
+from colmap_netvlad.photos.folders import photo_folders
 from colmap_netvlad.project import Project
+from colmap_netvlad.retrieval.methods import deep
 from colmap_netvlad.retrieval.options import RetrievalOptions
 from colmap_netvlad.retrieval.rank import rank_project
-from colmap_netvlad.runtime import cluster, workers
+from colmap_netvlad.runtime import cluster, progress, workers
 from colmap_netvlad.runtime.cluster import on_cluster
 from colmap_netvlad.runtime.errors import InputError
 from colmap_netvlad.runtime.jobs import Capacity, Job, Load, Source
@@ -43,6 +48,7 @@ from colmap_netvlad.runtime.jobs import Capacity, Job, Load, Source
 os.environ["RAY_AUTH_MODE"] = "disabled"  # else Ray keeps a token in the home folder
 ray = pytest.importorskip("ray", reason="Ray is not installed: pip install colmap-netvlad[cluster]")
 ray_tasks = pytest.importorskip("colmap_netvlad.runtime.ray_tasks")
+ray_files = pytest.importorskip("colmap_netvlad.runtime.ray_files")
 cluster_utils = pytest.importorskip("ray.cluster_utils")
 
 pytestmark = pytest.mark.xdist_group("ray")
@@ -51,7 +57,7 @@ MakeProject = Callable[..., Project]
 LEAVE_SECONDS = 5.0
 """Ctrl-C takes less than 2 s; a busy machine has some more."""
 
-NODE = {"num_cpus": 1, "object_store_memory": 80 * 2**20}
+NODE: dict[str, Any] = {"num_cpus": 1, "object_store_memory": 80 * 2**20}
 QUICK_TO_MISS = {
     "health_check_initial_delay_ms": 0,
     "health_check_period_ms": 500,
@@ -62,8 +68,15 @@ QUICK_TO_MISS = {
 
 
 @pytest.fixture(scope="module")
-def machines() -> Iterator[Any]:
+def scratch(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The temporary disk of all machines."""
+    return tmp_path_factory.mktemp("scratch")
+
+
+@pytest.fixture(scope="module")
+def machines(scratch: Path) -> Iterator[Any]:
     """A head and two nodes more, a processor each."""
+    NODE["env_vars"] = {"TMPDIR": str(scratch)}
     made = cluster_utils.Cluster(
         initialize_head=True,
         head_node_args={**NODE, "include_dashboard": False, "_system_config": QUICK_TO_MISS},
@@ -191,6 +204,138 @@ def test_clusters(losing_a_node: list[str], matched_database: Path, tmp_path: Pa
             pycolmap.Reconstruction(path).summary() for path in sorted(state.glob("*/[0-9]"))
         ]
     assert models["many"] == models["one"] and models["one"]
+
+
+# Photos that the machines do not see
+
+
+@pytest.fixture
+def unseen(
+    connected: Any, flight: RenderedFlight, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Callable[[Path], Path]]:
+    """Returns paths to folders that this process alone sees; work goes on in small shares."""
+    if not Path("/proc/self/fd").is_dir():
+        pytest.skip("needs Linux's /proc")
+    monkeypatch.setattr(ray_tasks, "TASK_SECONDS", 0.1)
+    opened: list[int] = []
+
+    def hide(folder: Path) -> Path:
+        opened.append(os.open(folder, os.O_RDONLY))
+        return Path(f"/proc/self/fd/{opened[-1]}")
+
+    with on_cluster(connected.address):
+        yield hide
+    for folder in opened:
+        os.close(folder)
+
+
+def make_masks(flight: RenderedFlight, folder: Path) -> Path:
+    """Masks that hide the left half; of some photos under the other name."""
+    for number, name in enumerate(flight.names):
+        mask = np.full((300, 400), 255, np.uint8)
+        mask[:, :200] = 0
+        target = folder / (f"{name}.png" if number % 2 else f"{Path(name).stem}.png")
+        target.parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(target), mask)
+    return folder
+
+
+def left_behind(scratch: Path) -> list[Path]:
+    return list(scratch.glob(".colmap-netvlad.*"))
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_features_of_photos_that_are_sent(
+    masked: bool,
+    unseen: Callable[[Path], Path],
+    flight: RenderedFlight,
+    scratch: Path,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level(logging.INFO)
+    masks = make_masks(flight, tmp_path / "masks") if masked else None
+    options = FeatureOptions(max_features=300, masks=masks)
+    hidden = replace(options, masks=masks and unseen(masks))
+    one, many = tmp_path / "one.db", tmp_path / "many.db"
+    folder = unseen(flight.images)
+    report = extract_features(folder, many, hidden)
+    assert report == here(lambda: extract_features(flight.images, one, options))
+    assert tables(one) == tables(many)
+    said = [text for text in caplog.messages if "does not see" in text]
+    sizes = [(flight.images / name).stat().st_size for name in flight.names]
+    if masks is not None:
+        sizes += [mask.stat().st_size for mask in masks.rglob("*.png")]
+    mib = f"{sum(sizes) / 2**20:.1f} MiB together."
+    assert len(said) == 1 and said[0].startswith("The machine ")
+    assert said[0].endswith(f"see {folder}: files are sent along, at most {len(sizes)} of {mib}")
+    assert not left_behind(scratch)
+
+
+def test_descriptors_of_photos_that_are_sent(
+    unseen: Callable[[Path], Path],
+    project_copy: MakeProject,
+    tiny_checkpoint: Path,
+    scratch: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """One of them vanishes once it is known to be there, one is no more a photo."""
+    options, contents = RetrievalOptions(k=5, batch_size=1), deep._contents
+    rankings = []
+    for name, hide, run in (("many", unseen, lambda do: do()), ("one", lambda path: path, here)):
+        project = project_copy(name=name, copy_photos=True)
+        gone, broken, *_ = sorted(path.name for path in project.images.iterdir())
+        (project.images / broken).write_bytes(b"no photo")
+
+        def lose_one(*arguments: Any, gone: Path = project.images / gone) -> Any:
+            found = contents(*arguments)
+            gone.unlink()
+            return found
+
+        monkeypatch.setattr(deep, "_contents", lose_one)
+        sent = Project(project.database, hide(project.images))
+        rankings.append(run(lambda sent=sent: rank_project(sent, str(tiny_checkpoint), options)))
+    ranking, wanted = rankings
+    assert dict(ranking.left_out) == {gone: "is missing", broken: "is not a photo"}
+    assert ranking.left_out == wanted.left_out
+    assert np.array_equal(ranking.partners, wanted.partners)
+    assert np.array_equal(ranking.scores, wanted.scores)
+    assert not left_behind(scratch)
+
+
+def test_a_stopped_run_leaves_no_photos_behind(
+    unseen: Callable[[Path], Path], flight: RenderedFlight, scratch: Path, tmp_path: Path
+) -> None:
+    class Stopped:
+        def advance(self, count: int = 1) -> None:
+            if title == "Extracting features":
+                assert left_behind(scratch), "nothing is under way"
+                raise KeyboardInterrupt
+
+    @contextmanager
+    def reporter(name: str, total: int) -> Iterator[Stopped]:
+        nonlocal title
+        title = name
+        yield Stopped()
+
+    title = ""
+    options = FeatureOptions()
+    with progress.report_to(reporter), pytest.raises(KeyboardInterrupt):
+        extract_features(unseen(flight.images), tmp_path / "project.db", options)
+    assert not left_behind(scratch)
+
+
+def test_shares_that_are_sent_are_cut_by_what_they_weigh(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, size in (("a", 4), ("b", 4), ("c", 9), ("d", 0)):
+        (tmp_path / name).write_bytes(b"x" * size)
+    parcels = ray_files.Parcels(photo_folders(tmp_path, None), ["a", "b", "c", "d"])
+    names = ["a", "b", "c", "d", "gone", "../a"]
+    assert [parcels.fitting(names[at:], 8) for at in range(5)] == [2, 1, 1, 3, 2]
+    monkeypatch.setattr(ray_files, "SENT_BYTES", 4)
+    assert parcels.fitting(names, 8) == 1
+    assert [file.name for file in parcels.files(names)] == ["a", "b", "c", "d"]
 
 
 # The command line
@@ -354,28 +499,12 @@ def test_a_machine_with_another_version(connected: Any, monkeypatch: pytest.Monk
 def test_a_machine_without_the_package(connected: Any, tmp_path: Path) -> None:
     hidden = 'import sys; sys.modules["colmap_netvlad"] = None'
     (tmp_path / "sitecustomize.py").write_text(hidden)
-    node = connected.add_node(**NODE, env_vars={"PYTHONPATH": str(tmp_path)})
+    node = connected.add_node(**{**NODE, "env_vars": {"PYTHONPATH": str(tmp_path)}})
     try:
         with pytest.raises(InputError, match="lacks colmap-netvlad"):
             connect(connected.address)
     finally:
         connected.remove_node(node, allow_graceful=False)
-
-
-@pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="needs Linux's /proc")
-def test_a_photo_folder_that_a_machine_does_not_see(
-    connected: Any, flight: RenderedFlight, tmp_path: Path
-) -> None:
-    folder = os.open(flight.images, os.O_RDONLY)
-    mine = Path(f"/proc/self/fd/{folder}")  # a folder of this process alone
-    try:
-        with (
-            on_cluster(connected.address),
-            pytest.raises(InputError, match=f"The machine .* does not see {mine}"),
-        ):
-            extract_features(mine, tmp_path / "project.db", FeatureOptions(max_features=300))
-    finally:
-        os.close(folder)
 
 
 def take_nothing(database: Path, arguments: Sequence[Any], target: Path) -> None:

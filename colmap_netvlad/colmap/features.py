@@ -30,6 +30,7 @@ from colmap_netvlad.photos.files import (
     find_photos,
     read_header,
 )
+from colmap_netvlad.photos.folders import photo_folders
 from colmap_netvlad.photos.masks import find_mask
 from colmap_netvlad.runtime import progress, workers
 from colmap_netvlad.runtime.errors import InputError
@@ -269,13 +270,13 @@ def _extract_group(
     if group.mode == pycolmap.CameraMode.SINGLE and group.camera_id is None:
         group = replace(group, camera_id=_new_camera(images, database, group, options))
     parts = PartsOfImport(database, group.names)
-    seen = (images,) if options.masks is None else (images, options.masks)
     extracted = workers.stream(
-        partial(_extract, images, group, options),
+        partial(_extract, group, options),
         group.names,
         engine.initialiser(),
         Source(database, parts.part, parts.rows, write_rows),
-        Load(options.threads or 1, _scale_space(options), seen=seen),
+        Load(options.threads or 1, _scale_space(options)),
+        photo_folders(images, options.masks),
     )
     with closing(extracted) as counts:
         for count in counts:
@@ -283,12 +284,17 @@ def _extract_group(
 
 
 def _extract(
-    images: Path, group: _Group, options: FeatureOptions, database: Path, names: Sequence[str]
+    group: _Group,
+    options: FeatureOptions,
+    database: Path,
+    images: Path,
+    masks: Path | None,
+    names: Sequence[str],
 ) -> Iterator[int]:
     """Import photos of a group and extract their features, in chunks; yield how many each had."""
     reader = pycolmap.ImageReaderOptions()
-    if options.masks is not None:
-        reader.mask_path = options.masks
+    if masks is not None:
+        reader.mask_path = masks
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.num_threads = _threads(options)
     extraction.sift.max_num_features = options.max_features

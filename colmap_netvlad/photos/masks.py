@@ -32,7 +32,7 @@ def neutralise(pixels: NDArray[np.uint8], mask: Path) -> NDArray[np.uint8]:
     """
     shape = cv2.imdecode(np.frombuffer(read_bytes(mask), np.uint8), cv2.IMREAD_GRAYSCALE)
     if shape is None:
-        raise BadPhoto(f"has a mask that is no picture ({mask})")
+        raise BadPhoto(f"has a mask that is no picture ({mask.name})")
     size = (pixels.shape[1], pixels.shape[0])
     seen = cv2.resize(shape, size, interpolation=cv2.INTER_NEAREST) > 0
     fill = pixels[seen].mean(axis=0) if seen.any() else 128.0

@@ -40,6 +40,20 @@ class Source(Generic[Item]):
 
 
 @dataclass(frozen=True)
+class Folder(Generic[Item]):
+    """A folder of files that work reads. Who works on a machine that does not see them gets those
+    of its share, in a folder for that share alone.
+
+    Attributes:
+        path: where it lies.
+        files: `files(path, item)` names those that an item needs, relative to `path`.
+    """
+
+    path: Path
+    files: Callable[[Path, Item], Iterable[str]]
+
+
+@dataclass(frozen=True)
 class Load:
     """What a share or a job takes of a machine, for those who choose between machines.
 
@@ -47,13 +61,11 @@ class Load:
         processors: how many keep it busy.
         memory: most bytes that it holds; 0 where that is little.
         gpu: whether it runs on a GPU where machines have some.
-        seen: files and folders that it reads where they are; all machines must see them.
     """
 
     processors: int = 1
     memory: float = 0.0
     gpu: bool = False
-    seen: tuple[Path, ...] = ()
 
 
 LIGHT = Load()
@@ -71,11 +83,18 @@ class Work(Generic[Item, Result]):
     initialiser: Callable[[], None] = nothing
     source: Source[Item] | None = None
     load: Load = LIGHT
+    folders: tuple[Folder[Item] | None, ...] = ()
+
+    @property
+    def places(self) -> tuple[Path | None, ...]:
+        """Where the folders lie."""
+        return tuple(None if folder is None else folder.path for folder in self.folders)
 
     @property
     def here(self) -> Callable[..., Result]:
-        """The function of a share, for who opens the source itself."""
-        return self.function if self.source is None else partial(self.function, self.source.path)
+        """The function of a share, for who opens the source and sees the folders itself."""
+        sources = () if self.source is None else (self.source.path,)
+        return partial(self.function, *sources, *self.places)
 
 
 @dataclass(frozen=True)
@@ -142,20 +161,20 @@ class Shares(Generic[Item]):
     """
 
     def __init__(self, items: Sequence[Item], first: int, seconds: float | None) -> None:
-        self._items, self._at = items, 0
+        self.items, self._at = items, 0
         self._first, self._seconds = first, seconds
         self._size = float(first)
 
     def __bool__(self) -> bool:
-        return self._at < len(self._items)
+        return self._at < len(self.items)
 
     def next(self, workers: int) -> Sequence[Item]:
         """Return the next share: smaller ones towards the end, so that all workers end together."""
         size = int(self._size)
         if self._seconds is not None:
-            even = (len(self._items) - self._at) // (AHEAD * workers)
+            even = (len(self.items) - self._at) // (AHEAD * workers)
             size = max(1, min(size, max(self._first, even)))
-        share = self._items[self._at : self._at + size]
+        share = self.items[self._at : self._at + size]
         self._at += len(share)
         return share
 

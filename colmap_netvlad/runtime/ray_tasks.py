@@ -7,16 +7,19 @@ constructor a process keeps between tasks (`_order`).
 Retried is what a machine did: a process or machine that is lost, an I/O fault. What our own code
 says of its input is not. A loop over `ray.wait` keeps few shares under way, and fewer where the
 parts of the database that they carry would fill this machine's object store.
+
+Files in folders are read where they lie, or sent (`runtime.ray_files`).
 """
 
 from __future__ import annotations
 
 import contextlib
+import itertools
 import math
-import socket
 import time
+from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -36,10 +39,10 @@ from colmap_netvlad.runtime.jobs import (
     Outcome,
     Result,
     Shares,
-    Source,
     Work,
 )
 from colmap_netvlad.runtime.processes import outcome_of
+from colmap_netvlad.runtime.ray_files import File, Parcels, Sent, Unseen, own_name, unpacked, unseen
 from colmap_netvlad.runtime.version import VERSION
 
 TASK_SECONDS = 30.0
@@ -56,7 +59,10 @@ POLL_SECONDS = 0.5
 """How long to wait for a task before looking at Ctrl-C and at the machines."""
 
 STORE_SHARE = 0.5
-"""Share of this machine's object store that waiting parts of the database may take."""
+"""Share of this machine's object store that waiting parts of the database and files may take."""
+
+CLEAR_SECONDS = 3.0
+"""How long tasks that nobody waits for may take to clear up, before their processes are killed."""
 
 ALONE_SECONDS = 60.0
 """How long to wait for a machine when none is left."""
@@ -70,6 +76,7 @@ class Order:
     initialiser: Callable[[], None]
     take: Callable[[Path, Sequence[Any]], Any] | None
     load: Load
+    places: tuple[Path | None, ...] = ()
     version: str = VERSION
 
 
@@ -93,7 +100,7 @@ class Call:
     """One task: a share, and who writes its part of the database."""
 
     share: Sequence[Any]
-    part: Callable[[Path], None] | None = None
+    part: Callable[[Sequence[Any], Path], None] | None = None
 
 
 @dataclass
@@ -122,8 +129,10 @@ class RayTasks:
         """Work at each share in a task."""
         shares.lengthen(TASK_SECONDS)
         source, load = work.source, _fitting(work.load)
-        order = Order(work.function, work.initialiser, source.take if source else None, load)
-        with contextlib.closing(_tasks(order, _calls(shares, source, load))) as tasks:
+        take = source.take if source else None
+        order = Order(work.function, work.initialiser, take, load, work.places)
+        parcels = Parcels(work.folders, shares.items)
+        with contextlib.closing(_tasks(order, _calls(shares, work, load), parcels)) as tasks:
             for call, done in tasks:
                 if isinstance(done, Exception):
                     raise done
@@ -137,7 +146,7 @@ class RayTasks:
     ) -> Generator[Result, None, None]:
         """Work at each share in a task."""
         shares = Shares(items, first, TASK_SECONDS)
-        listed = Work(partial(_listed, work.function), work.initialiser, work.source, work.load)
+        listed = replace(work, function=partial(_listed, work.function))
         with contextlib.closing(self.results(listed, shares, 0)) as results:
             for result in results:
                 yield from result
@@ -156,7 +165,7 @@ class RayTasks:
             return outcomes
         calls = (_call_of(number, job) for number, job in enumerate(jobs))
         order = Order(_do_job, initialiser, None, _fitting(jobs[0].load))
-        with contextlib.closing(_tasks(order, calls, workers)) as tasks:
+        with contextlib.closing(_tasks(order, calls, Parcels((), ()), workers)) as tasks:
             for call, done in tasks:
                 (number, *_) = call.share[0]
                 if isinstance(done, Exception):
@@ -169,20 +178,38 @@ class RayTasks:
         return outcomes
 
 
-def _calls(shares: Shares[Item], source: Source[Item] | None, load: Load) -> Iterator[Call]:
+def _calls(shares: Shares[Item], work: Work[Item, Any], load: Load) -> Iterator[Call]:
+    part = None if work.source is None else partial(work.source.part, work.source.path)
     while shares:
-        share = shares.next(max(1, _slots(load)))
-        yield Call(share, None if source is None else partial(source.part, source.path, share))
+        yield Call(shares.next(max(1, _slots(load))), part)
 
 
 def _call_of(number: int, job: Job) -> Call:
-    assert job.source is not None  # `workers.run` keeps other jobs on this machine
-    part = partial(job.source.part, job.source.path, job.arguments)
+    source = job.source
+    assert source is not None  # `workers.run` keeps other jobs on this machine
+
+    def part(share: Sequence[Any], target: Path) -> None:
+        source.part(source.path, job.arguments, target)
+
     return Call([(number, job.function, job.arguments)], part)
 
 
+@dataclass(frozen=True)
+class _Running:
+    """A task under way.
+
+    Attributes:
+        stored: what it was sent; that stays while it may be retried.
+        size: of that, bytes.
+    """
+
+    call: Call
+    stored: Any
+    size: int
+
+
 def _tasks(
-    order: Order, calls: Iterator[Call], most: float = math.inf
+    order: Order, calls: Iterator[Call], parcels: Parcels[Any], most: float = math.inf
 ) -> Generator[tuple[Call, Done | Exception], None, None]:
     """Yield calls and what they handed back, or why they failed, as they end; at most `most` are
     under way."""
@@ -196,26 +223,36 @@ def _tasks(
         retry_exceptions=[OSError, MemoryError],
     )(work)
     reference = ray.put(order)
-    running: dict[Any, tuple[Call, Any, int]] = {}  # the part stays while its task may be retried
+    running: dict[Any, _Running] = {}
     store = STORE_SHARE * _own_store()
-    waiting: Call | None = next(calls, None)
+    todo: deque[Call] = deque()
     slots, looked, lonely = _slots(load), time.monotonic(), 0.0
     try:
-        while waiting is not None or running:
-            while (
-                waiting is not None
-                and len(running) < min(most, max(1, AHEAD * slots))
-                and (sum(size for *_, size in running.values()) < store or not running)
+        while True:
+            while len(running) < min(most, max(1, AHEAD * slots)) and (
+                sum(other.size for other in running.values()) < store or not running
             ):
-                part = _part(waiting)
-                stored = None if part is None else ray.put(part)
-                started = task.remote([reference], waiting.share, stored)
-                running[started] = waiting, stored, len(part or b"")
-                waiting = next(calls, None)
+                todo.extend(itertools.islice(calls, 0 if todo else 1))
+                if not todo:
+                    break
+                call = todo.popleft()
+                if parcels.sent:
+                    count = parcels.fitting(call.share, store / max(1, AHEAD * slots))
+                    if count < len(call.share):
+                        todo.appendleft(replace(call, share=call.share[count:]))
+                        call = replace(call, share=call.share[:count])
+                running |= _started(task, reference, call, parcels)
+            if not running:
+                break
             ready, _ = ray.wait(list(running), timeout=POLL_SECONDS)
             for ended in ready:
-                call, *_ = running.pop(ended)
-                yield call, _handed_back(ended)
+                call = running.pop(ended).call
+                done = _handed_back(ended)
+                if isinstance(done, Unseen):
+                    parcels.send(done)
+                    todo.appendleft(call)
+                else:
+                    yield call, done
             now = time.monotonic()
             if now - looked > POLL_SECONDS:
                 slots = _slots(load)
@@ -227,9 +264,31 @@ def _tasks(
                     "stays. Start some and run the command again."
                 )
     finally:
-        for left in running:
-            with contextlib.suppress(Exception):
-                ray.cancel(left, force=True)
+        _give_up(list(running))
+
+
+def _started(task: Any, reference: Any, call: Call, parcels: Parcels[Any]) -> dict[Any, _Running]:
+    """Start the task of a call."""
+    part, files = _part(call), list(parcels.files(call.share))
+    stored = None if part is None else ray.put(part)
+    sent = list(parcels.packed(files)) if parcels.sent else None
+    size = len(part or b"") + sum(file.size for file, _ in sent or ())
+    # What lies in a list is fetched by the task itself, if it wants it.
+    started = task.remote([reference], call.share, stored, files, sent)
+    return {started: _Running(call, (stored, sent), size)}
+
+
+def _give_up(tasks: list[Any]) -> None:
+    """End tasks: they are asked to, so that they leave nothing on their machines' disks, then
+    killed."""
+    if not tasks:
+        return
+    with contextlib.suppress(Exception):
+        for task in tasks:
+            ray.cancel(task)
+        ray.wait(tasks, num_returns=len(tasks), timeout=CLEAR_SECONDS)
+        for task in tasks:
+            ray.cancel(task, force=True)
 
 
 def _part(call: Call) -> bytes | None:
@@ -237,13 +296,13 @@ def _part(call: Call) -> bytes | None:
         return None
     with scratch_folder() as folder:
         target = folder / "part.db"
-        call.part(target)
+        call.part(call.share, target)
         return target.read_bytes()
 
 
-def _handed_back(ended: Any) -> Done | Exception:
+def _handed_back(ended: Any) -> Done | Unseen | Exception:
     try:
-        done: Done = ray.get(ended)
+        done: Done | Unseen = ray.get(ended)
         return done
     except RayTaskError as fault:
         cause = fault.cause
@@ -277,11 +336,11 @@ def _fitting(load: Load) -> Load:
     with_gpu = [resources for resources in machines if resources.get("GPU", 0) >= 1]
     if load.gpu and with_gpu:
         each = min(int(resources.get("CPU", 1) // resources["GPU"]) for resources in with_gpu)
-        return Load(max(1, each), 0.0, True, load.seen)
+        return Load(max(1, each), 0.0, True)
     most = max((resources.get("CPU", 0) for resources in machines), default=1)
     memory = max((resources.get("memory", 0) for resources in machines), default=0.0)
     processors = max(1, min(load.processors, int(most)))
-    return Load(processors, int(min(load.memory, memory)), False, load.seen)
+    return Load(processors, int(min(load.memory, memory)))
 
 
 def _slots(load: Load) -> int:
@@ -299,24 +358,29 @@ _kept: tuple[str, Order] | None = None
 """The order this process works at; its initialiser was called."""
 
 
-def work(references: list[Any], share: Sequence[Any], part: bytes | None) -> Done:
+def work(
+    references: list[Any],
+    share: Sequence[Any],
+    part: bytes | None,
+    files: Sequence[File],
+    sent: Sent | None,
+) -> Done | Unseen:
     """Do a task: one share of an order (in a worker of Ray)."""
     order = _order(references[0])
-    for path in order.load.seen:
-        if not path.exists():
-            raise InputError(
-                f"The machine {_own_name()} of the cluster does not see {path}; put it on storage "
-                "that all machines see under the same path."
-            )
-    with contextlib.ExitStack() as stack:
-        files: list[Path] = []
+    with scratch_folder() as folder:
+        places, missing = order.places, unseen(order.places, files)
+        if missing is not None:
+            if sent is None:
+                return Unseen(own_name(), missing)
+            places = unpacked(sent, places, folder)
+        parts: list[Path] = []
         if part is not None:
-            files.append(stack.enter_context(scratch_folder()) / "part.db")
-            files[0].write_bytes(part)
+            parts.append(folder / "part.db")
+            parts[0].write_bytes(part)
         start = time.monotonic()
-        value = order.function(*files, share)
+        value = order.function(*parts, *places, share)
         seconds = time.monotonic() - start
-        taken = None if order.take is None else order.take(files[0], share)
+        taken = None if order.take is None else order.take(parts[0], share)
     return Done(value, taken, seconds)
 
 
@@ -327,17 +391,13 @@ def _order(reference: Any) -> Order:
         order: Order = ray.get(reference)
         if order.version != VERSION:
             raise InputError(
-                f"The machine {_own_name()} of the cluster has colmap-netvlad {VERSION}, the one "
+                f"The machine {own_name()} of the cluster has colmap-netvlad {VERSION}, the one "
                 f"that asks {order.version}; install the same on all."
             )
         machine.allot(order.load.processors)
         order.initialiser()
         _kept = reference.hex(), order
     return _kept[1]
-
-
-def _own_name() -> str:
-    return f"{socket.gethostname()} ({ray.util.get_node_ip_address()})"
 
 
 def _listed(function: Callable[..., Iterable[Result]], *arguments: Any) -> list[Result]:

@@ -15,6 +15,7 @@ from colmap_netvlad.runtime.jobs import (
     LIGHT,
     Capacity,
     Engine,
+    Folder,
     Item,
     Job,
     Load,
@@ -77,6 +78,7 @@ def results(
     initialiser: Callable[[], None] = nothing,
     source: Source[Item] | None = None,
     load: Load = LIGHT,
+    folders: tuple[Folder[Item] | None, ...] = (),
     *,
     first: int = 1,
     seconds: float | None = None,
@@ -89,6 +91,7 @@ def results(
     Args:
         initialiser: is called once in each process.
         source: what the function reads: its path is handed over before the share.
+        folders: what else it reads: their paths are handed over between the two, None for None.
         first: items of the first share.
         seconds: how long a share should take; None: all have `first` items.
 
@@ -100,7 +103,8 @@ def results(
     work here are waited for: long ones look at `unwanted` now and then, and stop.
     """
     shares = Shares(items, first, seconds)
-    return _engine.results(Work(function, initialiser, source, load), shares, workers)
+    work = Work(function, initialiser, source, load, folders)
+    return _engine.results(work, shares, workers)
 
 
 def stream(
@@ -109,6 +113,7 @@ def stream(
     initialiser: Callable[[], None] = nothing,
     source: Source[Item] | None = None,
     load: Load = LIGHT,
+    folders: tuple[Folder[Item] | None, ...] = (),
     *,
     first: int = 1,
 ) -> Generator[Result, None, None]:
@@ -117,7 +122,7 @@ def stream(
     On this machine all items are one share, in this process; other machines take shares of them.
     Arguments and what is raised are as in `results`.
     """
-    return _engine.stream(Work(function, initialiser, source, load), items, first)
+    return _engine.stream(Work(function, initialiser, source, load, folders), items, first)
 
 
 def unwanted() -> bool:

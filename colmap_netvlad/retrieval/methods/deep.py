@@ -21,6 +21,7 @@ from colmap_netvlad.cache.store import Store
 from colmap_netvlad.flight import Flight
 from colmap_netvlad.models.catalogue import CATALOGUE
 from colmap_netvlad.photos.decode import load_batches
+from colmap_netvlad.photos.folders import photo_folders
 from colmap_netvlad.photos.masks import find_mask
 from colmap_netvlad.retrieval.described import cache_note, missing, rank_described
 from colmap_netvlad.retrieval.options import RetrievalOptions
@@ -148,11 +149,11 @@ def _describe(
     """Describe photos into the store, a transaction a batch; return (name -> reason) of the bad."""
     if not names:
         return {}
-    seen = (folder,) if options.masks is None else (folder, options.masks)
     described = workers.stream(
-        partial(_describe_share, Enclosed(checkpoint), folder, options),
+        partial(_describe_share, Enclosed(checkpoint), options),
         names,
-        load=Load(gpu=(options.device or "cuda").startswith("cuda"), seen=seen),
+        load=Load(gpu=(options.device or "cuda").startswith("cuda")),
+        folders=photo_folders(folder, options.masks),
         first=options.batch_size or BATCH_SIZE,
     )
     bad: dict[str, str] = {}
@@ -171,7 +172,7 @@ def _describe(
                 bar.advance(len(batch.names) + len(batch.bad))
     finally:
         _network.cache_clear()
-    return bad
+    return {name: bad[name] for name in names if name in bad}
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,12 +186,16 @@ class _Described:
 
 
 def _describe_share(
-    checkpoint: Enclosed, folder: Path, options: RetrievalOptions, names: Sequence[str]
+    checkpoint: Enclosed,
+    options: RetrievalOptions,
+    folder: Path,
+    masks: Path | None,
+    names: Sequence[str],
 ) -> Iterator[_Described]:
     """Describe photos batch by batch."""
     network = _network(checkpoint, options.device)
     size = options.batch_size or BATCH_SIZE
-    for batch in load_batches(folder, names, network.long_side, size, masks=options.masks):
+    for batch in load_batches(folder, names, network.long_side, size, masks=masks):
         vectors, maps = network.describe_with_cells(batch.pixels)
         cells = [Cells.of(features) for features in maps] if options.rerank else []
         yield _Described(batch.names, vectors, cells, batch.bad)
