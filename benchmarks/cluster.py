@@ -5,7 +5,9 @@
 
 `stages` runs each stage on this machine's processes and then as tasks of a Ray cluster that is
 this machine: wall, and CPU seconds of all processes together (looked at five times a second; Linux
-only). What Ray's own daemons take is in it, starting the cluster is not.
+only). What Ray's own daemons take is in it, starting the cluster is not. Each stage is a command of
+its own: connecting and starting processes is in it on both sides, where the stage starts any.
+Extracting and describing do not on this machine; Ray does them once more with its processes there.
 
 `driver` takes the driver's part of a task alone, for shares as large as 30 seconds of work are:
 making the part of the database, handing it to Ray, taking a result from Ray, writing it. CPU
@@ -14,15 +16,17 @@ seconds of this process, whose threads carry Ray's data too. The results are rea
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import pickle
 import shutil
 import sqlite3
+import sys
 import tempfile
 import threading
 import time
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -50,6 +54,7 @@ from colmap_netvlad.matching.options import MatchOptions
 from colmap_netvlad.matching.run import in_tiles, match_pairs
 from colmap_netvlad.models.catalogue import CATALOGUE, DEFAULT
 from colmap_netvlad.models.checkpoint import load_model
+from colmap_netvlad.photos.folders import photo_folders
 from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval.methods import deep
 from colmap_netvlad.retrieval.methods.deep import _describe_share
@@ -57,10 +62,13 @@ from colmap_netvlad.retrieval.options import RetrievalOptions
 from colmap_netvlad.runtime.cluster import on_cluster
 from colmap_netvlad.runtime.jobs import Enclosed
 from colmap_netvlad.runtime.machine import usable_processors
+from colmap_netvlad.runtime.ray_files import Parcels
 from colmap_netvlad.runtime.ray_tasks import Call, _part
 from colmap_netvlad.terminal import Group
 
 REPEATS = 3
+
+LOCAL, RAY, WARM = "local", "Ray", "Ray, processes there"
 
 LOOK_SECONDS = 0.2
 TICK = os.sysconf("SC_CLK_TCK")
@@ -142,6 +150,8 @@ def cli() -> None:
 def stages(photos: Path, most: int, k: int, max_features: int, cluster_size: int) -> None:
     """Run every stage both ways and print a table."""
     load_model(DEFAULT)  # what it imports is no stage's cost
+    # Processes start as the command's do: without what this script imports.
+    sys.modules["__main__"].__spec__ = importlib.util.find_spec("colmap_netvlad.cli")
     family = Family()
     costs: dict[str, tuple[int, str, dict[str, Cost]]] = {}
     with tempfile.TemporaryDirectory() as scratch:
@@ -151,21 +161,45 @@ def stages(photos: Path, most: int, k: int, max_features: int, cluster_size: int
         for photo in sorted(path for path in photos.rglob("*") if path.is_file())[:most]:
             shutil.copy(photo, images / photo.name)
 
-        def run(side: str) -> None:
+        def run(side: str, connected: Callable[[], AbstractContextManager[None]]) -> None:
             own = folder / side
             own.mkdir()
             database = own / "project.db"
             options = FeatureOptions(max_features=max_features)
 
-            def note(stage: str, units: int, unit: str, work: Callable[[], object]) -> None:
-                cost = measured(family, work)
-                costs.setdefault(stage, (units, unit, {}))[2][side] = cost
-                print(f"{side}, {stage}, {units:,} {unit}s: {cost}", flush=True)
+            def note(
+                stage: str,
+                units: int,
+                unit: str,
+                work: Callable[[], object],
+                again: Callable[[], object] | None = None,
+            ) -> None:
+                with ExitStack() as stack:
+                    found = {
+                        side: measured(family, lambda: (stack.enter_context(connected()), work()))
+                    }
+                    if again is not None and side == RAY:
+                        found[WARM] = measured(family, again)
+                costs.setdefault(stage, (units, unit, {}))[2].update(found)
+                print(f"{stage}, {units:,} {unit}s: {found}", flush=True)
 
             count = len(list(images.iterdir()))
-            note("features", count, "photo", lambda: extract_features(images, database, options))
+            other = own / "again.db"
+            note(
+                "features",
+                count,
+                "photo",
+                lambda: extract_features(images, database, options),
+                lambda: extract_features(images, other, options),
+            )
             names = image_names(database)
-            note("describe", count, "photo", lambda: describe(Project(database, images)))
+            note(
+                "describe",
+                count,
+                "photo",
+                lambda: describe(Project(database, images)),
+                lambda: describe(Project(other, images)),
+            )
             pairs = [(a, b) for i, a in enumerate(names) for b in names[i + 1 : i + 1 + k]]
             guided = without_matches(database, own / "guided.db")
             note(
@@ -188,35 +222,26 @@ def stages(photos: Path, most: int, k: int, max_features: int, cluster_size: int
                 lambda: map_clusters(database, clusters, state, MappingOptions()),
             )  # fmt: skip
 
-        run("local")
+        run(LOCAL, nullcontext)
         cluster = Cluster(
             initialize_head=True,
             head_node_args={"num_cpus": usable_processors(), "include_dashboard": False},
         )
         try:
-            with on_cluster(cluster.address):
-                run("Ray")
+            run(RAY, lambda: on_cluster(cluster.address))
         finally:
             cluster.shutdown()
-    overhead = Table(
-        "stage", "units", "local wall s", "Ray wall s", "ratio", "local CPU s", "Ray CPU s", "ratio"
-    )
-    total: dict[str, Cost] = {side: Cost(0, 0) for side in ("local", "Ray")}
+    table = Table("stage", "units", *(f"{side}: wall s, CPU s" for side in (LOCAL, RAY, WARM)))
     for stage, (units, unit, sides) in costs.items():
-        for side, cost in sides.items():
-            total[side].wall += cost.wall
-            total[side].cpu += cost.cpu
-        overhead.add_row(stage, f"{units:,} {unit}s", *ratio(sides))
-    overhead.add_row("all", "", *ratio(total))
-    Console(width=160).print(overhead)
+        cells = [shown(sides[side], sides[LOCAL]) for side in (LOCAL, RAY, WARM) if side in sides]
+        table.add_row(stage, f"{units:,} {unit}s", *cells)
+    Console(width=160).print(table)
 
 
-def ratio(sides: dict[str, Cost]) -> list[str]:
-    local, ray = sides["local"], sides["Ray"]
-    return [
-        f"{local.wall:.1f}", f"{ray.wall:.1f}", f"{ray.wall / local.wall:.2f}",
-        f"{local.cpu:.1f}", f"{ray.cpu:.1f}", f"{ray.cpu / local.cpu:.2f}",
-    ]  # fmt: skip
+def shown(cost: Cost, local: Cost) -> str:
+    """Return a cost, and the ratio of its CPU seconds to the local ones."""
+    ratio = "" if cost is local else f" ({cost.cpu / local.cpu:.2f})"
+    return f"{cost.wall:.1f}, {cost.cpu:.1f}{ratio}"
 
 
 @cli.command()
@@ -235,6 +260,7 @@ def driver(scene: str, images: int, pairs: tuple[int, ...]) -> None:
         names = image_names(source)[:images]
         with open_database(source) as colmap:
             ids = [row.image_id for row in colmap.images()][:images]
+        nothing = Parcels[str]((), names)
         near = in_tiles([(a, b) for i, a in enumerate(ids) for b in ids[i + 1 : i + 21]])
 
         def row(
@@ -243,34 +269,40 @@ def driver(scene: str, images: int, pairs: tuple[int, ...]) -> None:
             there: Callable[[], bytes],
             back: object,
             keep: Callable[[Any], None],
+            parcels: Parcels[str],
         ) -> None:
             result = ray.put(back)
-            sent = there()
+            files = list(parcels.files(names))
+            sent = len(there()) + sum(file.size for file in files)
             start = time.process_time()
             for _ in range(REPEATS):
-                held = ray.put(there())
+                held = ray.put(there()), list(parcels.packed(files))
                 keep(ray.get(result))
                 del held
             each = (time.process_time() - start) / REPEATS / count
-            sizes = [f"{len(data) / 2**20:.1f}" for data in (sent, pickle.dumps(back))]
+            sizes = [f"{size / 2**20:.1f}" for size in (sent, len(pickle.dumps(back)))]
             table.add_row(stage, f"{count:,}", *sizes, f"{1000 * each:.2f}", f"{1 / each:,.0f}")
 
         for count in pairs:
             share = near[:count]
             part = partial(_part, Call(share, partial(part_of_pairs, source)))
             report = match_block(Photos(), source, MatchOptions("guided"), share)
-            row("match, guided", len(share), part, report.results, partial(write_results, source))
+            keep_results = partial(write_results, source)
+            row("match, guided", len(share), part, report.results, keep_results, nothing)
             row(
                 "match, colmap",
                 len(share),
                 part,
                 rows_of_pairs(source, share),
                 partial(write_rows, source),
+                nothing,
             )
         parts = PartsOfImport(source, names)
         part = partial(_part, Call(names, partial(parts.part, source)))
         features = read_rows(source, dict.fromkeys(FEATURES, ("image_id", ids)))
-        row("features", len(names), part, features, partial(write_rows, source))
+        photos_sent = Parcels(photo_folders(Path(photos), None), names)
+        for title, parcels in (("features", nothing), ("features, photos sent", photos_sent)):
+            row(title, len(names), part, features, partial(write_rows, source), parcels)
         described = list(
             _describe_share(
                 Enclosed(CATALOGUE[DEFAULT].file()), RetrievalOptions(), Path(photos), None, names
@@ -284,7 +316,7 @@ def driver(scene: str, images: int, pairs: tuple[int, ...]) -> None:
                         "model", batch.names, batch.names, batch.vectors, 1.0, batch.cells
                     )
 
-            row("describe", len(names), lambda: b"", described, keep)
+            row("describe", len(names), lambda: b"", described, keep, nothing)
     Console(width=160).print(table)
 
 

@@ -461,7 +461,7 @@ def mapping_options(
         "--cluster",
         metavar="auto|HOST:PORT",
         help="Let the machines of a Ray cluster do the work: auto, the one that this machine is in,"
-        " or its head. All of them see the photos under the same path.",
+        " or its head. Photos that a machine does not see under the same path are sent to it.",
     )
 )
 def cluster_option(cluster: str | None) -> dict[str, Any]:

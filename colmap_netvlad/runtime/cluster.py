@@ -31,8 +31,8 @@ ANSWER_SECONDS = 60.0
 def on_cluster(address: str = "auto") -> Iterator[None]:
     """Let the machines of a Ray cluster do the work while the block runs.
 
-    Photos lie in a folder that all machines see under the same path; database and cache are
-    written by this machine alone. This machine is one of the cluster's.
+    Photos lie in a folder that all machines see under the same path, or are sent to those that do
+    not; database and cache are written by this machine alone. This machine is one of the cluster's.
 
     Args:
         address: HOST:PORT of the cluster's head, or "auto": the cluster this machine is in.
