@@ -260,7 +260,7 @@ def driver(scene: str, images: int, pairs: tuple[int, ...]) -> None:
         names = image_names(source)[:images]
         with open_database(source) as colmap:
             ids = [row.image_id for row in colmap.images()][:images]
-        nothing = Parcels[str]((), names)
+        unsent = Parcels[str]((), names)
         near = in_tiles([(a, b) for i, a in enumerate(ids) for b in ids[i + 1 : i + 21]])
 
         def row(
@@ -269,7 +269,7 @@ def driver(scene: str, images: int, pairs: tuple[int, ...]) -> None:
             there: Callable[[], bytes],
             back: object,
             keep: Callable[[Any], None],
-            parcels: Parcels[str],
+            parcels: Parcels[str] = unsent,
         ) -> None:
             result = ray.put(back)
             files = list(parcels.files(names))
@@ -287,21 +287,19 @@ def driver(scene: str, images: int, pairs: tuple[int, ...]) -> None:
             share = near[:count]
             part = partial(_part, Call(share, partial(part_of_pairs, source)))
             report = match_block(Photos(), source, MatchOptions("guided"), share)
-            keep_results = partial(write_results, source)
-            row("match, guided", len(share), part, report.results, keep_results, nothing)
+            row("match, guided", len(share), part, report.results, partial(write_results, source))
             row(
                 "match, colmap",
                 len(share),
                 part,
                 rows_of_pairs(source, share),
                 partial(write_rows, source),
-                nothing,
             )
         parts = PartsOfImport(source, names)
         part = partial(_part, Call(names, partial(parts.part, source)))
         features = read_rows(source, dict.fromkeys(FEATURES, ("image_id", ids)))
-        photos_sent = Parcels(photo_folders(Path(photos), None), names)
-        for title, parcels in (("features", nothing), ("features, photos sent", photos_sent)):
+        sent = Parcels(photo_folders(Path(photos), None), names)
+        for title, parcels in (("features", unsent), ("features, photos sent", sent)):
             row(title, len(names), part, features, partial(write_rows, source), parcels)
         described = list(
             _describe_share(
@@ -316,7 +314,7 @@ def driver(scene: str, images: int, pairs: tuple[int, ...]) -> None:
                         "model", batch.names, batch.names, batch.vectors, 1.0, batch.cells
                     )
 
-            row("describe", len(names), lambda: b"", described, keep, nothing)
+            row("describe", len(names), lambda: b"", described, keep)
     Console(width=160).print(table)
 
 
