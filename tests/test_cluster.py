@@ -266,9 +266,11 @@ def test_features_of_photos_that_are_sent(
     sizes = [(flight.images / name).stat().st_size for name in flight.names]
     if masks is not None:
         sizes += [mask.stat().st_size for mask in masks.rglob("*.png")]
-    mib = f"{sum(sizes) / 2**20:.1f} MiB together."
+    mib = f"{sum(sizes) / 2**20:.1f} MiB"
     assert len(said) == 1 and said[0].startswith("The machine ")
-    assert said[0].endswith(f"see {folder}: files are sent along, at most {len(sizes)} of {mib}")
+    assert said[0].endswith(
+        f"see {folder}: photos are sent there, at most {len(sizes)} files ({mib})."
+    )
     assert not left_behind(scratch)
 
 

@@ -88,13 +88,13 @@ class Parcels(Generic[Item]):
         sizes = [file.size for file in self.files(self._items)]
         minutes = round(sum(sizes) / NETWORK_BYTES / 60)
         logger.info(
-            "The machine %s of the cluster does not see %s: files are sent along, at most %s of "
-            "%s MiB together%s.",
+            "The machine %s of the cluster does not see %s: photos are sent there, at most %s "
+            "files (%s MiB%s).",
             unseen.machine,
             unseen.place,
             f"{len(sizes):,}",
             f"{sum(sizes) / 2**20:,.1f}",
-            f", {minutes} min at 1 Gbit/s" if minutes else "",
+            f", {minutes} min of a network of 1 Gbit/s" if minutes else "",
         )
 
     def packed(self, files: Iterable[File]) -> Iterator[tuple[File, Any]]:
