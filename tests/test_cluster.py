@@ -25,6 +25,7 @@ from click.testing import CliRunner, Result
 
 from colmap_netvlad.cache.store import Store
 from colmap_netvlad.cli import cli
+from colmap_netvlad.colmap import features
 from colmap_netvlad.colmap.database import image_names, open_database
 from colmap_netvlad.colmap.features import FeatureOptions, extract_features
 from colmap_netvlad.demo.render import RenderedFlight
@@ -116,6 +117,7 @@ def losing_a_node(connected: Any, monkeypatch: pytest.MonkeyPatch) -> Iterator[l
     monkeypatch.setattr(ray_tasks, "TASK_SECONDS", 0.1)
     monkeypatch.setattr(matching, "CHUNK_SECONDS", 0.1)
     monkeypatch.setattr(matching, "FIRST_CHUNK", 4)
+    monkeypatch.setattr(features, "SHARE_PHOTOS", 1)
     monkeypatch.setattr(blocks, "BLOCK", 4)
     for module in (matching, blocks):
         monkeypatch.setattr(module, "WORTH_A_PROCESS", 4)
@@ -217,6 +219,7 @@ def unseen(
     if not Path("/proc/self/fd").is_dir():
         pytest.skip("needs Linux's /proc")
     monkeypatch.setattr(ray_tasks, "TASK_SECONDS", 0.1)
+    monkeypatch.setattr(features, "SHARE_PHOTOS", 1)
     opened: list[int] = []
 
     def hide(folder: Path) -> Path:

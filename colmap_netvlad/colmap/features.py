@@ -40,6 +40,10 @@ from colmap_netvlad.runtime.machine import usable_memory, usable_processors
 CHUNK_PHOTOS = 8
 """Photos of one chunk for each thread; the bar moves once a chunk."""
 
+SHARE_PHOTOS = 4
+"""Photos of the smallest share for another machine: each call of COLMAP's makes SIFT's scale space
+anew, which takes an eighth of a photo's time."""
+
 SIFT_LONG_SIDE = 3200
 """COLMAP's limit for SIFT where no max image size is given, px."""
 
@@ -277,6 +281,7 @@ def _extract_group(
         Source(database, parts.part, parts.rows, write_rows),
         Load(options.threads or 1, _scale_space(options)),
         photo_folders(images, options.masks),
+        first=SHARE_PHOTOS,
     )
     with closing(extracted) as counts:
         for count in counts:
