@@ -87,8 +87,10 @@ class PartsOfImport:
     def rows(self, part: Path, names: Sequence[str]) -> Rows:
         """Return everything in a part."""
         with closing(sqlite3.connect(part)) as connection, connection:
+            # By way of negative numbers: one by one, a row would get the number of another.
+            connection.execute("UPDATE pose_priors SET pose_prior_id = -pose_prior_id")
             connection.execute(
-                "UPDATE pose_priors SET pose_prior_id = pose_prior_id + ?",
+                "UPDATE pose_priors SET pose_prior_id = ? - pose_prior_id",
                 (self._last_prior + self._first_place(names),),
             )
         return read_rows(part, dict.fromkeys((*CAMERAS, *IMPORTED, *FEATURES)))
