@@ -314,8 +314,7 @@ def test_a_stopped_run_leaves_no_photos_behind(
     class Stopped:
         def advance(self, count: int = 1) -> None:
             if title == "Extracting features":
-                assert left_behind(scratch), "nothing is under way"
-                raise KeyboardInterrupt
+                raise KeyboardInterrupt  # with other shares under way, unless they have just ended
 
     @contextmanager
     def reporter(name: str, total: int) -> Iterator[Stopped]:
