@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -106,6 +108,19 @@ def test_reduced_search_finds_what_exact_search_finds_and_the_same_twice(
     monkeypatch.setattr(search, "SHORTLIST", 0)
     alone, _ = nearest(vectors, 20)
     assert np.mean([len(set(a) & set(b)) / 20 for a, b in zip(alone, truth, strict=True)]) < found
+
+
+def test_the_sample_of_reduced_search_keeps_no_more_than_its_rows(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    vectors = clustered(4000, 256, 0)
+    monkeypatch.setattr(search, "BLOCK_BYTES", 1 << 16)
+    tracemalloc.start()
+    sample = search._spread(vectors.astype(np.float16), 64)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert len(sample) == 64
+    assert peak < vectors.nbytes / 2 + 4 * sample.nbytes + (1 << 18)  # beside the float16 itself
 
 
 @given(count=st.integers(2, 40), k=st.integers(1, 50), dim=st.integers(1, 9), copies=st.booleans())
