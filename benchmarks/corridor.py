@@ -69,6 +69,7 @@ def main() -> None:
     parser.add_argument("--lines", type=int, default=3)
     parser.add_argument("--photos", type=int, default=100)
     parser.add_argument("--mappers", nargs="+", default=["incremental", "parallel"])
+    parser.add_argument("--positions", choices=["after", "in"], nargs="+", default=["after", "in"])
     parser.add_argument("--rendered", type=Path, help="folder of a flight of rendered photos")
     parser.add_argument("--threads", type=int)
     arguments = parser.parse_args()
@@ -77,7 +78,7 @@ def main() -> None:
     print("|---" * HEAD.count(" | ") + "|---|")
     for noise in arguments.noise:
         for mapper in arguments.mappers:
-            for positions in ("after", "in"):
+            for positions in arguments.positions:
                 rows = [
                     measure(arguments, noise, mapper, positions, seed)
                     for seed in range(arguments.seeds)

@@ -8,10 +8,10 @@ from pathlib import Path
 import pycolmap
 
 from colmap_netvlad.colmap import engine
-from colmap_netvlad.mapping.incremental import pipeline_options
-from colmap_netvlad.mapping.options import MappingOptions
+from colmap_netvlad.mapping.options import MappingOptions, pipeline_options
 from colmap_netvlad.mapping.output import Finish, as_mapped, model_folder, numbered
 from colmap_netvlad.mapping.priors import with_priors
+from colmap_netvlad.mapping.settle import settle
 from colmap_netvlad.runtime import progress
 from colmap_netvlad.runtime.errors import InputError
 
@@ -78,22 +78,25 @@ def extend_model(
     read_model(model)
     pipeline = pipeline_options(options, colors=images is not None)
     pipeline.multiple_models = False
-    with (
-        model_folder(output) as folder,
-        with_priors(database, options.priors, folder.parent) as source,
-        progress.step("Registering images", candidates) as bar,
-    ):
+    with model_folder(output) as folder:
         # Continuing a model, COLMAP writes straight into its output folder.
-        (folder / "0").mkdir()
-        models = engine.call(
-            pycolmap.incremental_mapping,
-            folder,
-            source,
-            images or folder,
-            folder / "0",
-            options=pipeline,
-            input_path=model,
-            next_image_callback=bar.advance,
-        )
+        extended = folder / "0"
+        extended.mkdir()
+        with (
+            with_priors(database, options.priors, folder.parent) as source,
+            progress.step("Registering images", candidates) as bar,
+        ):
+            engine.call(
+                pycolmap.incremental_mapping,
+                folder,
+                source,
+                images or folder,
+                extended,
+                options=pipeline,
+                input_path=model,
+                next_image_callback=bar.advance,
+            )
+        settle(database, folder, options)
+        result = pycolmap.Reconstruction(extended)
         finish(folder)
-        return models[max(models, key=lambda index: models[index].num_reg_images())]
+    return result

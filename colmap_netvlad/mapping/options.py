@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from colmap_netvlad.mapping.priors import PositionPriors
+import pycolmap
+
+from colmap_netvlad.mapping.priors import LOSS_SCALE, PositionPriors
+from colmap_netvlad.runtime.machine import usable_processors
 
 
 @dataclass(frozen=True)
@@ -33,3 +36,22 @@ class MappingOptions:
     cluster_size: int | None = None
     memory: float | None = None
     priors: PositionPriors | None = None
+
+
+def pipeline_options(
+    options: MappingOptions, *, colors: bool
+) -> pycolmap.IncrementalPipelineOptions:
+    """Return COLMAP's options of incremental mapping, every seed set."""
+    pipeline = pycolmap.IncrementalPipelineOptions()
+    pipeline.min_model_size = options.min_model_size
+    pipeline.max_num_models = options.max_models
+    pipeline.extract_colors = colors
+    pipeline.random_seed = options.seed
+    pipeline.mapper.random_seed = options.seed
+    pipeline.triangulation.random_seed = options.seed
+    if options.priors is not None:
+        pipeline.use_prior_position = True
+        pipeline.use_robust_loss_on_prior_position = True
+        pipeline.prior_position_loss_scale = LOSS_SCALE
+    pipeline.num_threads = pipeline.mapper.num_threads = options.threads or usable_processors()
+    return pipeline

@@ -23,13 +23,13 @@ import pycolmap
 from colmap_netvlad.colmap import engine
 from colmap_netvlad.colmap.copies import copy_images
 from colmap_netvlad.graph.viewgraph import ViewGraph, read_view_graph
-from colmap_netvlad.mapping.incremental import pipeline_options
 from colmap_netvlad.mapping.merge import merge, read_sub_model
-from colmap_netvlad.mapping.options import MappingOptions
+from colmap_netvlad.mapping.options import MappingOptions, pipeline_options
 from colmap_netvlad.mapping.output import Finish, as_mapped, model_folder, numbered
 from colmap_netvlad.mapping.partition import Cluster, partition
 from colmap_netvlad.mapping.priors import with_priors, write_priors
 from colmap_netvlad.mapping.refine import load_cache, rebuild, refine
+from colmap_netvlad.mapping.settle import settle
 from colmap_netvlad.runtime import progress, workers
 from colmap_netvlad.runtime.errors import InputError
 from colmap_netvlad.runtime.files import write_atomically
@@ -141,6 +141,7 @@ def reconstruct_parallel(
         state = open_state(output, graph, clusters, options)
         report = map_clusters(database, clusters, state, options)
         merge_clusters(database, images, state, folder, options, report)
+        settle(database, folder, options)
         models = [pycolmap.Reconstruction(path) for path in numbered(folder)]
         finish(folder)
     forget_clusters(output)

@@ -13,8 +13,8 @@ import pycolmap
 
 from colmap_netvlad.colmap import engine
 from colmap_netvlad.colmap.database import open_database
-from colmap_netvlad.mapping.incremental import map_incremental, pipeline_options
-from colmap_netvlad.mapping.options import MappingOptions
+from colmap_netvlad.mapping.incremental import map_incremental
+from colmap_netvlad.mapping.options import MappingOptions, pipeline_options
 from colmap_netvlad.mapping.output import Finish, as_mapped, model_folder
 from colmap_netvlad.mapping.parallel import CLUSTER_IMAGES, map_parallel
 from colmap_netvlad.runtime import workers

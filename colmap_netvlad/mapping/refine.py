@@ -14,8 +14,9 @@ from colmap_netvlad.mapping.merge import SubModel
 MIN_NUM_MATCHES = 15
 """Verified matches a pair needs to be used: the default of COLMAP's mappers."""
 
-SEAM_ITERATIONS = 20
-"""Iterations of the first bundle adjustment, which need not converge."""
+ROBUST_ITERATIONS = 20
+"""Iterations of a robust bundle adjustment, which need not converge: with 50 instead, the errors of a
+corridor of 300 photos with RTK are the same to a tenth of a millimetre."""
 
 DIRECT_IMAGES = 5000
 """Up to this many images the sparse direct solver is used; COLMAP changes to an iterative one at
@@ -88,10 +89,7 @@ def refine(
     """
     mapper = pycolmap.IncrementalMapper(cache)
     mapper.begin_reconstruction(reconstruction)
-    robust = bundle_options(options)
-    robust.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    robust.ceres.solver_options.max_num_iterations = SEAM_ITERATIONS
-    mapper.adjust_global_bundle(options.get_mapper(), robust)
+    adjust_robustly(mapper, options, pycolmap.LossFunctionType.CAUCHY)
     if triangulate:
         for image_id in reconstruction.reg_image_ids():
             mapper.triangulate_image(options.get_triangulation(), image_id)
@@ -115,6 +113,18 @@ def refine(
     mapper.end_reconstruction(False)
     reconstruction.update_point_3d_errors()
     reached(1.0)
+
+
+def adjust_robustly(
+    mapper: pycolmap.IncrementalMapper,
+    options: pycolmap.IncrementalPipelineOptions,
+    loss: pycolmap.LossFunctionType,
+) -> None:
+    """Adjust a mapper's whole model with a robust loss on reprojection errors of 1 px and more."""
+    bundle = bundle_options(options)
+    bundle.ceres.loss_function_type = loss
+    bundle.ceres.solver_options.max_num_iterations = ROBUST_ITERATIONS
+    mapper.adjust_global_bundle(options.get_mapper(), bundle)
 
 
 def bundle_options(

@@ -23,7 +23,6 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
 from colmap_netvlad.colmap.database import open_database
-from colmap_netvlad.mapping.incremental import pipeline_options
 from colmap_netvlad.mapping.merge import (
     Refused,
     SubModel,
@@ -34,7 +33,7 @@ from colmap_netvlad.mapping.merge import (
     shared_points,
     similarity,
 )
-from colmap_netvlad.mapping.options import MappingOptions
+from colmap_netvlad.mapping.options import MappingOptions, pipeline_options
 from colmap_netvlad.mapping.refine import load_cache, rebuild, refine
 
 SOLVED_POINTS = 500
