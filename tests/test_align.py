@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pycolmap
 import pytest
+from scipy.spatial.transform import Rotation
 
 from colmap_netvlad.geo.align import Alignment, NotAligned, align, moved
 
@@ -99,6 +100,23 @@ def test_on_one_line_the_photos_are_level(sway: float) -> None:
 
 def test_two_flights_at_one_height_are_no_line() -> None:
     assert solve(flight(lines=2), flight(lines=2)).notes == ()
+
+
+def test_a_compact_flight_is_no_line_however_poor_its_gps() -> None:
+    noise, squares = 2.0, []
+    true = np.array([(16.0 * line, 13.0 * photo, 45.0) for line in range(3) for photo in range(4)])
+    centres, rotations = model_of(true)
+    names = [f"{i}.jpg" for i in range(len(true))]
+    for seed in range(20):
+        random = np.random.default_rng(seed)
+        sway = Rotation.from_euler("xy", random.normal(0, 2, (len(true), 2)), degrees=True)
+        known = true + random.normal(0, noise, true.shape)
+        found = align(names, centres, sway.as_matrix() @ rotations, known)
+        assert found.notes == ()
+        squares.append((moved(found.world_from_model, centres) - true) ** 2)
+    # Of seven parameters a shift and two tilts are in height: 3 of 12, the other four on two axes.
+    expected = noise * np.sqrt([2 / 12, 2 / 12, 3 / 12])
+    assert np.sqrt(np.mean(squares, axis=(0, 1))) == pytest.approx(expected, rel=0.3)
 
 
 @pytest.mark.parametrize(

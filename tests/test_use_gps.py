@@ -79,7 +79,7 @@ def test_rtk_keeps_a_corridor_within_five_centimetres(
     assert [path.name for path in tmp_path.iterdir()] == ["in"]
 
 
-@pytest.mark.parametrize(("noise", "within"), [(RTK, 0.05)])
+@pytest.mark.parametrize(("noise", "within"), [(2.0, 1.5 * 2.0), (RTK, 0.05)])
 def test_rendered_photos_lie_within_the_noise_of_their_gps(
     noise: float,
     within: float,

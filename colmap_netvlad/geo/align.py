@@ -34,6 +34,10 @@ MIN_OUTLIER = 0.05
 LINE_ANGLE = 0.02
 """Places lie on one line where the noise leaves the turn about it open by more than this, rad."""
 
+LINE_SHAPE = 5.0
+"""And where they spread so many times as much along it as beside: in a compact flight there is no such
+line, and levelling it about a diagonal would tilt it the other way."""
+
 LINE_WIDTH = 1e-3
 """Or where their spread beside the line is below this share of the spread along it."""
 
@@ -228,7 +232,8 @@ def _far(residuals: Array, agreed: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def _on_line(places: Array, residuals: Array) -> bool:
     spread = np.linalg.svd(places - places.mean(axis=0), compute_uv=False)
     noise = np.sqrt(np.nanmean(residuals**2) * 3)
-    return bool(spread[1] < LINE_WIDTH * spread[0] or noise > LINE_ANGLE * spread[1])
+    open_turn = noise > LINE_ANGLE * spread[1] and LINE_SHAPE * spread[1] < spread[0]
+    return bool(spread[1] < LINE_WIDTH * spread[0] or open_turn)
 
 
 def _level(similarity: pycolmap.Sim3d, centres: Array, rotations: Array) -> pycolmap.Sim3d:

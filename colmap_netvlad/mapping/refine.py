@@ -15,8 +15,8 @@ MIN_NUM_MATCHES = 15
 """Verified matches a pair needs to be used: the default of COLMAP's mappers."""
 
 ROBUST_ITERATIONS = 20
-"""Iterations of a robust bundle adjustment, which need not converge: with 50 instead, the errors of a
-corridor of 300 photos with RTK are the same to a tenth of a millimetre."""
+"""Iterations of a robust bundle adjustment, which need not converge: with 50 instead, the errors of
+a corridor of 300 photos with RTK are the same to a tenth of a millimetre."""
 
 DIRECT_IMAGES = 5000
 """Up to this many images the sparse direct solver is used; COLMAP changes to an iterative one at
