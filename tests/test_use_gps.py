@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -30,10 +31,14 @@ from colmap_netvlad.mapping.incremental import map_incremental
 from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.mapping.parallel import map_parallel
 from colmap_netvlad.mapping.priors import PositionPriors, write_priors
+from colmap_netvlad.mapping.settle import best_similarity
 from colmap_netvlad.photos.accuracy import read_deviations
 from colmap_netvlad.project import Project
 
 RTK = 0.02
+SHARP = SimulationOptions(
+    lines=2, photos=8, features=1000, partners=12, noise=0.2, gps=RTK, focal_error=0
+)
 CORRIDOR = SimulationOptions(lines=2, photos=30, features=150, partners=12, gps=RTK, focal_error=0)
 
 
@@ -100,6 +105,48 @@ def test_rendered_photos_lie_within_the_noise_of_their_gps(
     truth = dict(zip(flight.names, flight.centres, strict=True))
     error = errors(tmp_path / "in", Corridor(database, truth, places, priors))
     assert np.sqrt((error**2).mean(axis=0)).max() < within
+
+
+@pytest.mark.parametrize("mapper", [map_incremental, map_parallel])
+def test_wrong_matches_do_not_pull_a_camera_from_its_rtk(tmp_path: Path, mapper: object) -> None:
+    """A shift and a tilt that make up for each other move what is near the edges by some pixels."""
+    database = tmp_path / "database.db"
+    truth = simulate_flight(database, SHARP)
+    with closing(pycolmap.Database.open(database)) as opened, pycolmap.DatabaseTransaction(opened):
+        image = opened.read_image_with_name(list(truth)[4])
+        width = opened.read_camera(image.camera_id).width
+        keypoints = opened.read_keypoints(image.image_id).copy()
+        edge = np.flatnonzero(abs(keypoints[:, 0] - width / 2) > width / 4)
+        wrong = np.random.default_rng(0).choice(edge, len(keypoints) // 5, replace=False)
+        keypoints[wrong, 0] += 3
+        opened.update_keypoints(image.image_id, keypoints)
+    places = find_places(tuple(truth), database, None)
+    priors = PositionPriors(places.names, places.metres, np.full(places.metres.shape, RTK))
+    assert callable(mapper)
+    mapper(
+        database, None, tmp_path / "in", MappingOptions(threads=1, cluster_size=8, priors=priors)
+    )
+    georegister_in_place(tmp_path / "in", places, adjusted=True)
+    assert np.abs(errors(tmp_path / "in", Corridor(database, truth, places, priors))).max() < 0.06
+
+
+def test_the_best_similarity_brings_a_moved_model_back() -> None:
+    model = pycolmap.synthesize_dataset(pycolmap.SyntheticDatasetOptions(num_frames_per_rig=10))
+    images = [model.image(i) for i in model.reg_image_ids()]
+    centres = np.array([image.projection_center() for image in images])
+    known = centres.copy()
+    known[3] += [40, 0, 0]
+    known[4] = np.nan
+    known[5, 2] = np.nan
+    names = tuple(image.name for image in images)
+    deviations = np.full(known.shape, 0.1)
+    turn = pycolmap.Rotation3d(np.array([0.02, -0.01, 0.03]))
+    model.transform(pycolmap.Sim3d(1.02, turn, np.array([0.3, -0.2, 0.1])))
+    model.transform(best_similarity(model, PositionPriors(names, known, deviations)))
+    found = np.array([image.projection_center() for image in images])
+    assert found == pytest.approx(centres, abs=0.01)
+    stays = best_similarity(model, PositionPriors(names[:2], known[:2], deviations[:2]))
+    assert (stays.matrix() == pycolmap.Sim3d().matrix()).all()
 
 
 def test_without_priors_in_the_adjustment_the_corridor_bends(

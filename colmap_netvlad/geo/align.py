@@ -35,8 +35,8 @@ LINE_ANGLE = 0.02
 """Places lie on one line where the noise leaves the turn about it open by more than this, rad."""
 
 LINE_SHAPE = 5.0
-"""And where they spread so many times as much along it as beside: in a compact flight there is no such
-line, and levelling it about a diagonal would tilt it the other way."""
+"""And where they spread so many times as much along it as beside: a compact flight has no line, and
+levelling it about a diagonal would tilt it the other way."""
 
 LINE_WIDTH = 1e-3
 """Or where their spread beside the line is below this share of the spread along it."""

@@ -5,6 +5,9 @@ its filter of 4 px then outweigh a position: over flat ground, where a shift and
 they pull single cameras many of RTK's standard deviations away, and the robust loss on positions
 lets them go. With a robust loss on reprojection errors too, a position has its due say, and a wild
 one still has little.
+
+That adjustment ends where gradients are small, as those of positions good to metres always are. No
+similarity changes a reprojection error, so the one that suits the positions best is found apart.
 """
 
 from __future__ import annotations
@@ -12,15 +15,24 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pycolmap
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
 
 from colmap_netvlad.colmap import engine
 from colmap_netvlad.mapping.options import MappingOptions, pipeline_options
 from colmap_netvlad.mapping.output import numbered
-from colmap_netvlad.mapping.priors import with_priors
+from colmap_netvlad.mapping.priors import LOSS_SCALE, PositionPriors, with_priors
 from colmap_netvlad.mapping.refine import adjust_robustly, load_cache
 from colmap_netvlad.runtime import progress, workers
 from colmap_netvlad.runtime.errors import InputError
+
+MIN_POSITIONS = 3
+"""Positions that a similarity needs."""
+
+Floats = NDArray[np.float64]
 
 
 def settle(database: Path, folder: Path, options: MappingOptions) -> None:
@@ -56,6 +68,7 @@ def settle_models(
     options: MappingOptions,
 ) -> None:
     """Adjust models and write them again (in a worker)."""
+    assert options.priors is not None
     with with_priors(database, options.priors, folder) as source:
         cache = load_cache(source)
     pipeline = pipeline_options(options, colors=False)
@@ -67,6 +80,40 @@ def settle_models(
         adjust_robustly(mapper, pipeline, pycolmap.LossFunctionType.SOFT_L1)
         mapper.filter_points(pipeline.get_mapper())
         mapper.end_reconstruction(False)
+        model.transform(best_similarity(model, options.priors))
         model.update_point_3d_errors()
         model.write(path)
         advance(1)
+
+
+def best_similarity(model: pycolmap.Reconstruction, priors: PositionPriors) -> pycolmap.Sim3d:
+    """Return the similarity with the least cost of the positions, for a model that lies nearly so.
+
+    The cost is the adjustment's own: by standard deviations, with Cauchy's loss.
+    """
+    images = {model.image(i).name: model.image(i) for i in model.reg_image_ids()}
+    rows = [
+        row
+        for row, (name, place) in enumerate(zip(priors.names, priors.metres, strict=True))
+        if name in images and np.isfinite(place[:2]).all()
+    ]
+    if len(rows) < MIN_POSITIONS:
+        return pycolmap.Sim3d()
+    centres = np.array([images[priors.names[row]].projection_center() for row in rows])
+    places = np.nan_to_num(priors.metres[rows])
+    weights = np.isfinite(priors.metres[rows]) / priors.deviations[rows]
+    middle = centres.mean(axis=0)
+    size = np.sqrt(((centres - middle) ** 2).sum(axis=1).mean())
+
+    def similarity(values: Floats) -> pycolmap.Sim3d:
+        turn = np.exp(values[0] / size) * Rotation.from_rotvec(values[1:4] / size).as_matrix()
+        return pycolmap.Sim3d(np.column_stack([turn, middle - turn @ middle + values[4:]]))
+
+    def misfits(values: Floats) -> Floats:
+        matrix = similarity(values).matrix()
+        misfit = (centres @ matrix[:, :3].T + matrix[:, 3] - places) * weights
+        square = (misfit**2).sum(axis=1, keepdims=True) / LOSS_SCALE**2 + 1e-12  # not 0 / 0
+        robust: Floats = (misfit * np.sqrt(np.log1p(square) / square)).ravel()
+        return robust
+
+    return similarity(least_squares(misfits, np.zeros(7), x_scale="jac").x)
