@@ -16,11 +16,17 @@ import pytest
 from colmap_netvlad.colmap.database import image_names, open_database
 from colmap_netvlad.colmap.features import FeatureOptions, extract_features
 from colmap_netvlad.commands import add
-from colmap_netvlad.commands.add import AddOptions, add_lines, add_photos, newest_model
+from colmap_netvlad.commands.add import (
+    AddOptions,
+    add_lines,
+    add_photos,
+    newest_model,
+    priors_of,
+)
 from colmap_netvlad.commands.georegister import georegister_in_place
 from colmap_netvlad.demo.render import RenderedFlight
-from colmap_netvlad.geo.georeference import read_frame
-from colmap_netvlad.geo.places import find_places
+from colmap_netvlad.geo.georeference import read_frame, read_place
+from colmap_netvlad.geo.places import DEFAULT_DEVIATIONS, find_places
 from colmap_netvlad.mapping.incremental import map_incremental
 from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.matching.options import MatchOptions
@@ -107,7 +113,9 @@ def test_a_model_in_the_world_stays_there(
     places = find_places(image_names(project.database), project.database, project.images)
     (placed,) = georegister_in_place(project.sparse, places)
     assert placed.georeference is not None
-    replace(placed.georeference, adjusted=adjusted).write(project.sparse / "0")
+    gps_std = (0.5, 1.0) if adjusted else None
+    stated = replace(placed.georeference, adjusted=adjusted, gps_std=gps_std)
+    stated.write(project.sparse / "0")
     frame, before = read_frame(project.sparse / "0"), centres(project.sparse / "0")
     for photo in photos:
         shutil.copy(photo, project.images / photo.name)
@@ -122,6 +130,11 @@ def test_a_model_in_the_world_stays_there(
     assert len(apart) == len(flight.names) and apart.max() < 1.0
     told = json.loads((report.output / "0/georeference.json").read_text())
     assert told["adjusted_with_positions"] is adjusted
+    place = read_place(report.output / "0")
+    assert place is not None and place.gps_std == gps_std
+    assert tuple(priors_of(project, place).deviations[0]) == (
+        (0.5, 0.5, 1.0) if adjusted else DEFAULT_DEVIATIONS
+    )
     assert set(told["photos"]) == set(flight.names)
     said = "\n".join(add_lines(report))
     assert "Photos were added; those the model had stayed where they were." in said

@@ -171,7 +171,7 @@ def add_photos(
 
     dropped: list[Pair] = []
     place, placed = read_place(model), None
-    priors = _priors(project, place) if place is not None and place.adjusted else None
+    priors = priors_of(project, place) if place is not None and place.adjusted else None
 
     def finish(models: Path) -> None:
         """Bring the model to where the one given is, and note how it was made."""
@@ -209,11 +209,11 @@ def add_photos(
     )
 
 
-def _priors(project: Project, place: Place) -> PositionPriors:
+def priors_of(project: Project, place: Place) -> PositionPriors:
     """Return the positions of all photos in the frame of a model that was adjusted with them."""
     names = image_names(project.database)
     places = find_places(names, project.database, project.images, place.frame)
-    deviations, _ = find_deviations(names, project.database, project.images)
+    deviations, _ = find_deviations(names, project.database, project.images, place.gps_std)
     return PositionPriors(places.names, places.metres, deviations)
 
 

@@ -170,6 +170,7 @@ def georegister_in_place(
     control: ControlList | None = None,
     *,
     adjusted: bool = False,
+    gps_std: tuple[float, float] | None = None,
     seed: int = 0,
 ) -> list[Placed]:
     """Bring the models that a mapper has just written into the world, where they are.
@@ -179,6 +180,7 @@ def georegister_in_place(
         places: known positions.
         control: ground points, which place the models instead.
         adjusted: the mapper had these positions as priors, so the models are in their frame.
+        gps_std: what it was told of all of them, m horizontal and vertical, if it was.
         seed: of RANSAC.
     """
     placed = []
@@ -186,7 +188,14 @@ def georegister_in_place(
         draft = Path(tempfile.mkdtemp(prefix=temporary_prefix(path), dir=folder))
         try:
             one = place_model(
-                path.name, read_model(path), places, draft, control, adjusted=adjusted, seed=seed
+                path.name,
+                read_model(path),
+                places,
+                draft,
+                control,
+                adjusted=adjusted,
+                gps_std=gps_std,
+                seed=seed,
             )
             if one.georeference is not None:
                 for file in sorted(draft.iterdir()):
@@ -236,7 +245,7 @@ def keep_place(
         )
     lying = as_it_lies(names, centres, places.of(names))
     alignment = replace(lying, world_from_model=moved, notes=tuple(notes))
-    georeference = Georeference(place.frame, alignment, adjusted)
+    georeference = Georeference(place.frame, alignment, adjusted, place.gps_std)
     with tempfile.TemporaryDirectory(prefix=temporary_prefix(after), dir=after.parent) as temporary:
         model.write(temporary)
         georeference.write(Path(temporary))
@@ -253,6 +262,7 @@ def place_model(
     control: ControlList | None = None,
     *,
     adjusted: bool = False,
+    gps_std: tuple[float, float] | None = None,
     seed: int = 0,
 ) -> Placed:
     """Align one model and write it to `target`; a model that cannot be placed is not written."""
@@ -270,7 +280,7 @@ def place_model(
         if _lies_well(lying) and not alignment.notes:
             alignment = lying
     transformed(model, alignment).write(target)
-    georeference = Georeference(places.frame, alignment, adjusted)
+    georeference = Georeference(places.frame, alignment, adjusted, gps_std)
     georeference.write(target)
     return Placed(name, georeference)
 

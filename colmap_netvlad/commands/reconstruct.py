@@ -158,7 +158,12 @@ def reconstruct(
         if places is not None:
             placed.extend(
                 georegister_in_place(
-                    folder, places, control, adjusted=options.world.use_gps, seed=mapping.seed
+                    folder,
+                    places,
+                    control,
+                    adjusted=options.world.use_gps,
+                    gps_std=options.world.gps_std,
+                    seed=mapping.seed,
                 )
             )
         seconds["mapping"] = time.monotonic() - start

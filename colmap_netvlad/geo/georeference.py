@@ -29,12 +29,15 @@ class Georeference:
             database's priors.
         alignment: how it came there, and its residuals at the photos.
         adjusted: whether the positions were part of the bundle adjustment.
+        gps_std: the standard deviation that was given for all of them, m horizontal and vertical;
+            None: what each photo states.
         control: how ground points lie; None where there are none.
     """
 
     frame: LocalFrame | None
     alignment: Alignment
     adjusted: bool = False
+    gps_std: tuple[float, float] | None = None
     control: ControlReport | None = None
 
     def write(self, folder: Path) -> None:
@@ -93,6 +96,7 @@ class Georeference:
             "world_from_model": alignment.world_from_model.matrix().tolist(),
             "scale": np.asarray(alignment.world_from_model.scale).item(),
             "adjusted_with_positions": self.adjusted,
+            "gps_std": None if self.gps_std is None else list(self.gps_std),
             "residuals": {
                 "photos": int((~alignment.outliers).sum()),
                 "horizontal_rms": _number(alignment.horizontal),
@@ -117,11 +121,14 @@ class Place:
     Attributes:
         frame: its frame; None: the cartesian system of the database's priors.
         adjusted: whether the positions were part of the bundle adjustment.
+        gps_std: standard deviation given for all of them, m horizontal and vertical; None: what
+            each photo states.
         control: whether ground points placed it.
     """
 
     frame: LocalFrame | None
     adjusted: bool
+    gps_std: tuple[float, float] | None
     control: bool
 
 
@@ -140,8 +147,10 @@ def read_place(folder: Path) -> Place | None:
         if origin is not None:
             frame = LocalFrame(*(float(origin[key]) for key in ("latitude", "longitude", "height")))
         adjusted = bool(content.get("adjusted_with_positions"))
-        return Place(frame, adjusted, content.get("ground_points") is not None)
-    except (ValueError, KeyError, TypeError, AttributeError) as fault:
+        given = content.get("gps_std")
+        gps_std = None if given is None else (float(given[0]), float(given[1]))
+        return Place(frame, adjusted, gps_std, content.get("ground_points") is not None)
+    except (ValueError, LookupError, TypeError, AttributeError) as fault:
         raise InputError(f"{path} is damaged; run `colmap-netvlad georegister` again.") from fault
 
 
