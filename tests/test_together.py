@@ -199,14 +199,19 @@ def test_only_pairs_across_are_asked_for() -> None:
     assert pairs_across(ranking, [{"a", "b"}, {"b", "c", "d"}], 1) == [("a", "c"), ("a", "d")]
 
 
-@pytest.mark.parametrize("which", ["one", "stranger", "none"])
+@pytest.mark.parametrize("which", ["one", "stranger", "namesake", "none"])
 def test_bad_input_is_one_sentence(own: Flights, tmp_path: Path, which: str) -> None:
     sparse = {"one": own.models[:1], "none": [tmp_path / "x", tmp_path / "y"]}.get(which)
-    said = {"one": "One model alone", "none": "holds no COLMAP model", "stranger": "not in"}[which]
+    said = {
+        "one": "One model alone",
+        "none": "holds no COLMAP model",
+        "stranger": "not in",
+        "namesake": "Put photos with equal names into two folders of one",
+    }[which]
     if sparse is None:
         model = pycolmap.Reconstruction(own.models[0])
         image = next(iter(model.images.values()))
-        image.name = "other.jpg"
+        image.name = "other.jpg" if which == "stranger" else list(own.truth)[-1]
         (tmp_path / "strange").mkdir()
         model.write(tmp_path / "strange")
         sparse = [tmp_path / "strange", own.models[1]]

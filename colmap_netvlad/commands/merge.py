@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -13,7 +13,7 @@ import pycolmap
 
 from colmap_netvlad.cache.ranking import NO_PARTNER, Ranking
 from colmap_netvlad.colmap import engine
-from colmap_netvlad.colmap.database import image_names
+from colmap_netvlad.colmap.database import image_names, open_database
 from colmap_netvlad.commands.georegister import (
     Placed,
     find_models,
@@ -108,7 +108,9 @@ def merge_models(
     if len(given) < 2:
         raise InputError("One model alone cannot be merged; name two or more as `sparse`.")
     names = [str(folder) for _, folder in given]
-    known = set(image_names(project.database))
+    with open_database(project.database) as opened:
+        counts = opened.keypoint_counts()
+        features = {row.name: counts.get(row.image_id, 0) for row in opened.images()}
     target = free_output(project.sparse) if output is None else output
     with (
         model_folder(target) as folder,
@@ -122,7 +124,7 @@ def merge_models(
             model = read_model(Path(name))
             homes.append({model.image(i).name for i in model.reg_image_ids()})
             copies.append(
-                (name, _in_database(name, model, project, known, Path(scratch, str(number))))
+                (name, _in_database(name, model, project, features, Path(scratch, str(number))))
             )
         pairs = pairs_across(_ranking(project, options), homes, options.across)
         matches = match_pairs(project.database, pairs, MatchOptions(seed=options.seed))
@@ -186,16 +188,36 @@ def _ranking(project: Project, options: MergeOptions) -> Ranking:
 
 
 def _in_database(
-    name: str, model: pycolmap.Reconstruction, project: Project, known: set[str], target: Path
+    name: str,
+    model: pycolmap.Reconstruction,
+    project: Project,
+    features: Mapping[str, int],
+    target: Path,
 ) -> Path:
-    """Write a copy of a model with the image ids of the database, and return its folder."""
-    strangers = sorted(image.name for image in model.images.values() if image.name not in known)
+    """Write a copy of a model with the image ids of the database, and return its folder.
+
+    Args:
+        features: how many the database has of each image.
+    """
+    strangers = sorted(image.name for image in model.images.values() if image.name not in features)
     if strangers:
         raise InputError(
             f"{len(strangers)} photos of {name} (first: {strangers[0]}) are not in "
             f"{project.database}: bring the projects into one database first (COLMAP's "
             "database_merger; image names stay and must differ), or import all photos into one "
             "with `colmap-netvlad features`."
+        )
+    namesakes = sorted(
+        image.name
+        for image in model.images.values()
+        if image.num_points2D() != features[image.name]
+    )
+    if namesakes:
+        raise InputError(
+            f"{len(namesakes)} photos of {name} (first: {namesakes[0]}) have other features than "
+            f"those of their names in {project.database}: they are other photos, or their features "
+            "were made anew. Put photos with equal names into two folders of one, and begin with "
+            "`colmap-netvlad features` on it."
         )
     with engine.opened(project.database) as opened:
         model.transcribe_image_ids_to_database(opened)
