@@ -108,7 +108,8 @@ def rendered(arguments: argparse.Namespace, database: Path, noise: float, seed: 
     if not matched.exists():
         made = folder / "making.db"
         extract_features(flight.images, made, FeatureOptions(max_features=FEATURES))
-        _, near = cKDTree(flight.centres).query(flight.centres, PARTNERS + 1)
+        partners = min(PARTNERS, len(flight.names) - 1)
+        _, near = cKDTree(flight.centres).query(flight.centres, partners + 1)
         pairs = {tuple(sorted((i, int(j)))) for i, row in enumerate(near) for j in row if i != j}
         match_pairs(made, [(flight.names[i], flight.names[j]) for i, j in sorted(pairs)])
         made.rename(matched)
