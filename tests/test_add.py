@@ -231,3 +231,22 @@ def test_an_addition_stopped_before_its_page_makes_no_other_model(
     assert report.after.registered == report.before.registered + NEW
     with pytest.raises(InputError, match="There are no new photos"):
         add_photos(project, None, OPTIONS)
+
+
+def test_an_addition_stopped_after_its_page_is_done(
+    reconstructed: tuple[Project, list[Path]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The next photos join the model that it made, and not the one before."""
+    project, photos = reconstructed
+    # Its last step: the page is written, and the cache still says that it is being added.
+    stop_an_addition(project, photos[:-1], "registered_names", monkeypatch)
+    with pytest.raises(InputError, match="There are no new photos"):
+        add_photos(project, None, OPTIONS)
+    assert project.images is not None
+    shutil.copy(photos[-1], project.images / photos[-1].name)
+    report = add_photos(project, None, OPTIONS)
+    assert report.new == [photos[-1].name]
+    assert report.output.name == "sparse-3"
+    assert (
+        report.after.registered == report.before.registered + 1 == len(centres(report.output / "0"))
+    )

@@ -16,6 +16,7 @@ from colmap_netvlad.colmap.database import image_names, open_database
 from colmap_netvlad.colmap.features import FeatureOptions, FeatureReport, extract_features
 from colmap_netvlad.commands.georegister import Placed, keep_place
 from colmap_netvlad.commands.report import (
+    PAGE,
     FlightReport,
     made_before,
     read_run,
@@ -52,10 +53,12 @@ class Begun:
     Attributes:
         photos: their names.
         model: folder of the model they are to join.
+        output: folder of models for the extended one, once it is known.
     """
 
     photos: Sequence[str] = ()
     model: str = ""
+    output: str = ""
 
 
 @dataclass(frozen=True)
@@ -182,12 +185,13 @@ def add_photos(
         seconds["mapping"] = time.monotonic() - start
         save_runs(models, replace(run, seconds=seconds, dropped=len(dropped)))
 
-    target = made_before(output or project.sparse, run) if begun.photos else None
-    if target is not None:
+    made = made_before(output or project.sparse, run) if begun.photos else None
+    target = made or free_output(output or project.sparse)
+    _remember(project, Begun(new, str(model), str(target.absolute())))
+    if made is not None:
         after = read_model(target / "0")
         seconds["mapping"] = 0.0
     else:
-        target = free_output(output or project.sparse)
         mapping = MappingOptions(seed=options.seed, priors=priors)
         with mapping_database(project, options.drop_contradicted) as (kept, dropped):
             after = extend_model(kept, folder, model, target, len(usable), mapping, finish)
@@ -272,12 +276,20 @@ def _extends(model: Path) -> str | None:
 
 
 def _begun(project: Project) -> Begun:
+    """Return the addition that has not come to its end; one of no photos where there is none."""
     with Store(project.cache) as store:
         kept = store.setting(BEGUN_SETTING)
     try:
-        return Begun(**json.loads(kept or "{}"))
+        begun = Begun(**json.loads(kept or "{}"))
+        return Begun() if _ended(begun) else begun
     except (ValueError, TypeError):  # damaged
         return Begun()
+
+
+def _ended(begun: Begun) -> bool:
+    """Whether all that an addition writes is there: only its note is still to be taken back."""
+    extended = Path(begun.output) / "0"
+    return _extends(extended) == begun.model and (extended / PAGE).is_file()
 
 
 def _remember(project: Project, begun: Begun) -> None:
