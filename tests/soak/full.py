@@ -11,12 +11,10 @@ COLMAP itself writes is guarded by 64 MiB that stay free; half of the tries have
 from __future__ import annotations
 
 import argparse
-import os
 import shutil
 import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path
 
 import kill
@@ -36,19 +34,6 @@ def resize(disk: Path, size: int) -> None:
 def size(folder: Path) -> int:
     """Return what the files of a folder hold, bytes."""
     return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
-
-
-def ended(folder: Path, words: tuple[str, ...]) -> tuple[int, str]:
-    """Run a command; return its exit code and what it printed."""
-    process, began = kill.start(folder, *words), time.monotonic()
-    while time.monotonic() - began < kill.LONGEST:
-        done, status = os.waitpid(process, os.WNOHANG)
-        if done:
-            log = (folder.parent / "log.txt").read_text(errors="replace")
-            return os.waitstatus_to_exitcode(status), log
-        time.sleep(0.01)
-    os.kill(process, 9)
-    raise RuntimeError(f"{words} hangs")
 
 
 def main() -> int:
@@ -86,15 +71,14 @@ def main() -> int:
                 resize(disk, (used + room) // 4096 * 4096 + 4096)
                 wrong = []
                 try:
-                    code, log = ended(folder, kind.words)
+                    code, log = kill.ended(folder, kind.words)
                     if code and ("Traceback" in log or "Error: " not in log):
                         wrong.append(f"{room} bytes of room, exit code {code}: {log[-1500:]}")
                     refused += code != 0
                     wrong += [f"left {left}" for left in kill.left_behind(folder.resolve())]
                     resize(disk, ROOM)
                     kill.check_whole(folder.resolve())
-                    if not kill.finished(kind, folder):
-                        kill.run(folder, *kind.words)
+                    wrong += kill.complete(kind, folder)
                     wrong += kill.differences(kill.state(folder.resolve()), wanted)
                 except (RuntimeError, kill.sqlite3.Error) as fault:
                     wrong.append(str(fault))
@@ -110,7 +94,5 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    import pycolmap  # noqa: F401
-    import torch  # noqa: F401
-
+    kill.load()
     sys.exit(main())

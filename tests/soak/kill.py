@@ -18,8 +18,10 @@ from __future__ import annotations
 
 import argparse
 import hashlib
+import importlib
 import json
 import os
+import pkgutil
 import shutil
 import signal
 import sqlite3
@@ -35,6 +37,7 @@ from typing import Any
 
 import numpy as np
 
+import colmap_netvlad.commands
 from colmap_netvlad.cli import main as main_of_command
 
 PAGE = "report.html"
@@ -58,11 +61,13 @@ class Kind:
         words: its words, where {} stands for the project's folder.
         sound: prepares the folder that it starts from.
         makes: the model that a finished run has made, where another run makes another.
+        refusal: what a finished command says when it is run again, where it is refused.
     """
 
     words: tuple[str, ...]
     sound: Callable[[Path], None]
     makes: str = ""
+    refusal: str = ""
 
 
 def photos(folder: Path, seed: int = 0, rows: int = 2) -> None:
@@ -75,29 +80,29 @@ def photos(folder: Path, seed: int = 0, rows: int = 2) -> None:
     shutil.rmtree(folder / "flight")
 
 
-def features(folder: Path, rows: int = 2) -> None:
+def features(folder: Path, rows: int = 2, few: tuple[str, ...] = ()) -> None:
     """The same with features."""
     photos(folder, rows=rows)
-    run(folder, "features", "--images", "{}/images", "--db", "{}/project.db", *FEW)
+    run(folder, "features", "--images", "{}/images", "--db", "{}/project.db", *(few or FEW))
 
 
-def listed(folder: Path, rows: int = 2) -> None:
+def listed(folder: Path, rows: int = 2, few: tuple[str, ...] = ()) -> None:
     """The same with a list of all pairs."""
-    features(folder, rows)
+    features(folder, rows, few)
     names = sorted(path.name for path in (folder / "images").iterdir())
     pairs = [f"{a} {b}\n" for a in names for b in names if a < b]
     (folder / "pairs.txt").write_text("".join(pairs))
 
 
-def matched(folder: Path, rows: int = 2) -> None:
+def matched(folder: Path, rows: int = 2, few: tuple[str, ...] = ()) -> None:
     """The same, matched."""
-    listed(folder, rows)
+    listed(folder, rows, few)
     run(folder, "match", "--db", "{}/project.db")
 
 
 def larger(folder: Path) -> None:
     """Twelve photos, matched: models of fewer than ten are not merged."""
-    matched(folder, rows=3)
+    matched(folder, rows=3, few=("--max-features", "400", "--threads", "1"))
 
 
 def built(folder: Path) -> None:
@@ -141,7 +146,10 @@ KINDS = {
     "reconstruct": Kind(("reconstruct", *DB, *ONE), matched, "sparse/0"),
     "reconstruct-parallel": Kind(("reconstruct", *DB, *CLUSTERS), larger, "sparse/0"),
     "add": Kind(
-        ("add", *DB, "--images", "{}/images", "--method", "vlad", "--k", "5"), built, "sparse-2/0"
+        ("add", *DB, "--images", "{}/images", "--method", "vlad", "--k", "5"),
+        built,
+        "sparse-2/0",
+        "There are no new photos",
     ),
     "compare": Kind(
         ("compare", *DB, "--methods", "vlad,random", "--k", "2,3", "--no-reconstruct"), features
@@ -166,6 +174,7 @@ def start(folder: Path, *words: str) -> int:
         os.setpgid(process, process)
     if process:
         return process
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's job in the background
     log = os.open(folder.parent / "log.txt", os.O_CREAT | os.O_WRONLY | os.O_TRUNC)
     os.dup2(log, 1)
     os.dup2(log, 2)
@@ -195,15 +204,23 @@ def scratch_of(folder: Path) -> Path:
 def run(folder: Path, *words: str) -> float:
     """Run a command to its end and return how long it took, s."""
     began = time.monotonic()
-    process = start(folder, *words)
+    code, log = ended(folder, words)
+    if code != 0:
+        raise RuntimeError(f"{words}: {log}")
+    return time.monotonic() - began
+
+
+def ended(folder: Path, words: tuple[str, ...]) -> tuple[int, str]:
+    """Run a command; return its exit code and what it printed."""
+    process, began = start(folder, *words), time.monotonic()
     while time.monotonic() - began < LONGEST:
         done, status = os.waitpid(process, os.WNOHANG)
         if done:
-            if os.waitstatus_to_exitcode(status) != 0:
-                raise RuntimeError(f"{words}: {(folder.parent / 'log.txt').read_text()}")
-            return time.monotonic() - began
+            log = (folder.parent / "log.txt").read_text(errors="replace")
+            return os.waitstatus_to_exitcode(status), log
         time.sleep(0.01)
     os.killpg(process, signal.SIGKILL)
+    os.waitpid(process, 0)
     raise RuntimeError(f"{words} hangs")
 
 
@@ -235,6 +252,16 @@ def killed(
         time.sleep(0.002)
     os.killpg(process, signal.SIGKILL)
     raise RuntimeError(f"{words} does not end by {sent.name}")
+
+
+def complete(kind: Kind, folder: Path) -> list[str]:
+    """Run a command once more, where it has not come to its end, and return what was wrong."""
+    if not finished(kind, folder):
+        run(folder, *kind.words)
+    if not kind.refusal:
+        return []
+    code, log = ended(folder, kind.words)
+    return [] if code and kind.refusal in log else [f"run again: exit code {code}: {log[-1500:]}"]
 
 
 def finished(kind: Kind, folder: Path) -> bool:
@@ -400,8 +427,7 @@ def main() -> int:
             try:
                 stops, wrong = disturbed(kind, folder, seconds, sent, random)
                 took += stops
-                if not finished(kind, folder):
-                    run(folder, *kind.words)
+                wrong += complete(kind, folder)
                 wrong += differences(state(folder), wanted) + left_behind(folder)
             except (RuntimeError, sqlite3.Error) as fault:
                 wrong = [str(fault)]
@@ -418,9 +444,14 @@ def main() -> int:
     return 1 if faults else 0
 
 
-if __name__ == "__main__":
-    # Loaded once, before the processes part.
-    import pycolmap  # noqa: F401
+def load() -> None:
+    """Load what the commands load, once, before the processes part: their time is their work."""
     import torch  # noqa: F401
 
+    for module in pkgutil.iter_modules(colmap_netvlad.commands.__path__):
+        importlib.import_module(f"colmap_netvlad.commands.{module.name}")
+
+
+if __name__ == "__main__":
+    load()
     sys.exit(main())

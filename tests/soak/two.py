@@ -96,7 +96,5 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    import pycolmap  # noqa: F401
-    import torch  # noqa: F401
-
+    kill.load()
     sys.exit(main())
