@@ -49,6 +49,7 @@ from colmap_netvlad.cli_options import (
 from colmap_netvlad.cli_settings import SettingsCommand
 from colmap_netvlad.retrieval.options import RetrievalOptions
 from colmap_netvlad.runtime.errors import EXIT_PARTIAL
+from colmap_netvlad.runtime.files import remove_scratch
 from colmap_netvlad.runtime.plain import plain
 from colmap_netvlad.runtime.shell import command_line
 from colmap_netvlad.runtime.version import VERSION
@@ -91,6 +92,7 @@ def cli() -> None:
       colmap-netvlad pairs --db project.db --k 30
       colmap-netvlad reconstruct --db project.db
     """
+    remove_scratch()
 
 
 @cli.command()

@@ -6,7 +6,9 @@ import sys
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 
+from colmap_netvlad.cli import cli
 from colmap_netvlad.mapping.output import model_folder
 from colmap_netvlad.runtime import files
 from colmap_netvlad.runtime.errors import InputError
@@ -95,6 +97,19 @@ def test_what_a_killed_process_left_goes_with_the_next_run(
         pass
     assert sorted(work.iterdir()) == sorted([*foreign, work / "sparse", work / "pairs.txt"])
     assert list(scratch.iterdir()) == []
+
+
+def test_what_a_killed_process_left_goes_though_nothing_is_left_to_do(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(files.tempfile, "tempdir", str(tmp_path))
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    with scratch_folder() as living:
+        left = living.with_name(living.name.replace(f"-{os.getpid()}-", f"-{gone.pid}-"))
+        left.mkdir()
+        assert CliRunner().invoke(cli, ["methods"]).exit_code == 0
+        assert living.is_dir() and not left.exists()
 
 
 def test_hints_are_quoted_for_the_shell_at_hand(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -49,6 +49,7 @@ from colmap_netvlad.matching.options import MatchOptions, given_up_words
 from colmap_netvlad.matching.rounds import rounds_lines
 from colmap_netvlad.project import Project
 from colmap_netvlad.runtime.errors import InputError
+from colmap_netvlad.runtime.files import remove_scratch
 from colmap_netvlad.runtime.sequences import listed
 
 
@@ -169,6 +170,7 @@ def reconstruct(
         seconds["mapping"] = time.monotonic() - start
         save_runs(folder, replace(run, seconds=seconds, dropped=len(dropped)))
 
+    remove_scratch(project.folder)  # the copy that a stopped run mapped from
     target = made_before(output or project.sparse, run)
     if target is not None and not all_reported(target):
         models = read_models(target)

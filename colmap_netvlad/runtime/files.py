@@ -58,23 +58,15 @@ def temporary_prefix(path: Path) -> str:
     It says which process of which machine made it. What processes that are gone (killed: nobody
     tidied up after them) have left of the same `path` is removed.
     """
-    machine = re.sub(r"\W", "-", socket.gethostname())
-    for left in path.parent.glob(f".{glob.escape(path.name)}.{machine}-*"):
-        maker = re.match(r"(\d+)-", left.name.removeprefix(f".{path.name}.{machine}-"))
-        if maker is not None and not _runs(int(maker[1])):
-            if left.is_dir():
-                shutil.rmtree(left, ignore_errors=True)
-            else:
-                with suppress(OSError):
-                    left.unlink()
-    return f".{path.name}.{machine}-{os.getpid()}-"
+    _remove_left(path)
+    return f"{_prefix(path)}{os.getpid()}-"
 
 
 @contextmanager
 def scratch_folder(place: Path | None = None) -> Iterator[Path]:
     """Yield an empty folder in `place`, which is gone after the block.
 
-    Those of processes that were killed go with the next one.
+    Those of processes that were killed go with the next one, or with `remove_scratch`.
 
     Args:
         place: None: the system's temporary disk.
@@ -82,7 +74,7 @@ def scratch_folder(place: Path | None = None) -> Iterator[Path]:
     Raises:
         InputError: `place` cannot be written.
     """
-    base = Path(place or tempfile.gettempdir()) / "colmap-netvlad"
+    base = _scratch(place)
     try:
         folder = tempfile.mkdtemp(prefix=temporary_prefix(base), dir=base.parent)
     except OSError as fault:
@@ -91,6 +83,40 @@ def scratch_folder(place: Path | None = None) -> Iterator[Path]:
         yield Path(folder)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
+
+
+def remove_scratch(place: Path | None = None) -> None:
+    """Remove the scratch folders of processes that were killed.
+
+    A run that finds all done needs no scratch folder, and so would leave that of the run before it,
+    killed at its end.
+
+    Args:
+        place: as in `scratch_folder`.
+    """
+    with suppress(OSError):
+        _remove_left(_scratch(place))
+
+
+def _scratch(place: Path | None) -> Path:
+    return Path(place or tempfile.gettempdir()) / "colmap-netvlad"
+
+
+def _prefix(path: Path) -> str:
+    machine = re.sub(r"\W", "-", socket.gethostname())
+    return f".{path.name}.{machine}-"
+
+
+def _remove_left(path: Path) -> None:
+    prefix = _prefix(path)
+    for left in path.parent.glob(f"{glob.escape(prefix)}*"):
+        maker = re.match(r"(\d+)-", left.name.removeprefix(prefix))
+        if maker is not None and not _runs(int(maker[1])):
+            if left.is_dir():
+                shutil.rmtree(left, ignore_errors=True)
+            else:
+                with suppress(OSError):
+                    left.unlink()
 
 
 def _runs(process: int) -> bool:
