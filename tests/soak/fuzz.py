@@ -29,6 +29,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import kill
 import numpy as np
 from click.testing import CliRunner
 from PIL import Image
@@ -571,8 +572,5 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    # Loaded once, before the processes part.
-    import pycolmap  # noqa: F401
-    import torch  # noqa: F401
-
+    kill.load()
     sys.exit(main())
