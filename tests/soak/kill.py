@@ -37,7 +37,7 @@ from typing import Any
 
 import numpy as np
 
-import colmap_netvlad.commands
+import colmap_netvlad
 from colmap_netvlad.cli import main as main_of_command
 
 PAGE = "report.html"
@@ -446,10 +446,13 @@ def main() -> int:
 
 def load() -> None:
     """Load what the commands load, once, before the processes part: their time is their work."""
-    import torch  # noqa: F401
+    import faiss  # noqa: F401
+    import matplotlib.pyplot  # noqa: F401
+    import torch._dynamo  # noqa: F401, which optimizers load
 
-    for module in pkgutil.iter_modules(colmap_netvlad.commands.__path__):
-        importlib.import_module(f"colmap_netvlad.commands.{module.name}")
+    for module in pkgutil.walk_packages(colmap_netvlad.__path__, "colmap_netvlad."):
+        if not module.name.endswith(("__main__", "ray_tasks")):  # which needs the extra [cluster]
+            importlib.import_module(module.name)
 
 
 if __name__ == "__main__":
