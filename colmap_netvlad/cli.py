@@ -8,7 +8,6 @@ commands share stand in `cli_options`.
 from __future__ import annotations
 
 import json
-import signal
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -53,7 +52,7 @@ from colmap_netvlad.runtime.files import remove_scratch
 from colmap_netvlad.runtime.plain import plain
 from colmap_netvlad.runtime.shell import command_line
 from colmap_netvlad.runtime.version import VERSION
-from colmap_netvlad.terminal import Group, say
+from colmap_netvlad.terminal import Group, hear_interrupts, say
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -786,7 +785,7 @@ def finish_partial(left_out: list[str]) -> None:
 
 def main() -> None:
     """Run the command line: the entry point `colmap-netvlad`. SIGTERM stops it as Ctrl-C does."""
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    hear_interrupts()
     cli()
 
 

@@ -5,11 +5,14 @@ Progress and notes go to standard error, so that standard output stays a clean r
 
 from __future__ import annotations
 
+import _thread
 import errno
 import logging
 import re
+import signal
 import sqlite3
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -65,6 +68,34 @@ class Group(click.Group):
     """Commands of this kind."""
 
     command_class = Command
+
+
+def hear_interrupts() -> None:
+    """Let SIGTERM stop this process as Ctrl-C does, and neither be lost.
+
+    Python loses an exception that is raised while an object is taken apart (matplotlib's are, by
+    the thousand): it is then asked for again.
+    """
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    sys.unraisablehook = _interrupt_again
+
+
+def _interrupt_again(lost: sys.UnraisableHookArgs) -> None:
+    if lost.exc_type is not KeyboardInterrupt:
+        sys.__unraisablehook__(lost)
+        return
+    later = threading.Timer(0.01, _interrupt)
+    later.daemon = True
+    later.start()
+
+
+def _interrupt() -> None:
+    # SIGTERM: a job in the background may be deaf to Ctrl-C.
+    main = threading.main_thread().ident
+    if sys.platform == "win32" or main is None:
+        _thread.interrupt_main(signal.SIGTERM)
+    else:
+        signal.pthread_kill(main, signal.SIGTERM)  # wakes it where it waits
 
 
 def says_full(fault: OSError | sqlite3.OperationalError) -> bool:
