@@ -40,6 +40,7 @@ from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval.options import RetrievalOptions
 from colmap_netvlad.retrieval.rank import rank_project
 from colmap_netvlad.runtime.errors import InputError
+from colmap_netvlad.runtime.files import remove_scratch
 from colmap_netvlad.runtime.sequences import listed
 
 BEGUN_SETTING = "adding"
@@ -185,6 +186,7 @@ def add_photos(
         seconds["mapping"] = time.monotonic() - start
         save_runs(models, replace(run, seconds=seconds, dropped=len(dropped)))
 
+    remove_scratch(project.folder)  # the copy that a stopped run mapped from
     made = made_before(output or project.sparse, run) if begun.photos else None
     target = made or free_output(output or project.sparse)
     _remember(project, Begun(new, str(model), str(target.absolute())))
