@@ -332,6 +332,27 @@ def test_local_features_turn_with_the_photo(checkpoint, photos):
         np.testing.assert_allclose(turned, expected, atol=1e-3)
 
 
+def test_cells_along_principal_axes_keep_cosines_and_the_descriptor(network, photos, tmp_path):
+    channels = network.trunk.channels
+    turn = np.linalg.qr(np.random.default_rng(0).normal(size=(channels, channels)))[0]
+    found = {}
+    for count in (None, channels, 16):
+        axes = None if count is None else torch.from_numpy(turn[:count].astype(np.float32))
+        path = tmp_path / f"{count}.safetensors"
+        copy = GlobalDescriptor(network.trunk, network.aggregation, axes=axes).eval()
+        save_checkpoint(path, copy, CARD, half=False)
+        found[count] = load_model(path, "cpu").describe_with_cells(photos)
+    (whole, cells), (turned, all_axes), (few, shorter) = found.values()
+    np.testing.assert_array_equal(whole, turned)
+    np.testing.assert_array_equal(whole, few)
+    cosines = [np.einsum("bchw,bcij->bhwij", c, c) for c in (cells, all_axes)]
+    np.testing.assert_allclose(*cosines, atol=1e-4)
+    assert shorter.shape[1] == 16
+    expected = np.einsum("ac,bchw->bahw", turn[:16], cells)
+    expected /= np.linalg.norm(expected, axis=1, keepdims=True)
+    np.testing.assert_allclose(shorter, expected, atol=1e-4)
+
+
 def test_places_without_texture_have_no_local_feature(checkpoint, photos):
     model = load_model(checkpoint, "cpu")
     masked = photos.copy()

@@ -295,20 +295,28 @@ def test_an_image_that_was_left_out_stays_out(store: Store) -> None:
     assert 4 not in ranking.partners
 
 
-def test_a_cache_of_before_gets_its_tables(tmp_path: Path) -> None:
+def test_a_cache_of_before_forgets_longer_cells_and_keeps_what_is_not_described(
+    tmp_path: Path,
+) -> None:
     path = tmp_path / "project.netvlad.db"
     with Store(path) as store:
+        store.remember("a", "setting")
         store.add_descriptors("m", ["a"], ["1"], np.ones((1, 4), np.float32) / 2, 0)
         keep(store, [0])
         store._db.execute("ALTER TABLE cells RENAME TO local_features")
         store._db.execute("DROP TABLE photos")
         store._db.execute("CREATE TABLE rankings (method TEXT)")
         store._db.execute("PRAGMA user_version = 1")
-    with Store(path) as store:
-        assert store.described("m").keys() == {"a", "0.jpg"}
-        assert store.described_in_cells("m") == {"0.jpg": "0.jpg"}, "they are kept"
-        assert store.photos() == {}
-        assert "rankings" not in store._db.table_names()
+    for _ in range(2):
+        with Store(path) as store:
+            assert store.setting("a") == "setting"
+            assert store.described("m") == store.described_in_cells("m") == {}
+            assert store.photos() == {}
+            keep(store, [0])
+            assert store.described_in_cells("m") == {"0.jpg": "0.jpg"}
+            store._db.execute("DELETE FROM cells")
+            store._db.execute("DELETE FROM descriptors")
+            assert "rankings" not in store._db.table_names()
 
 
 def test_what_was_counted_for_a_photo_that_changed_is_pruned(tmp_path: Path) -> None:

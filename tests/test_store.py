@@ -35,18 +35,18 @@ def test_descriptors_come_back_in_the_order_asked_for(cache: Path) -> None:
     with Store(cache) as store:
         stored = store.vectors("m", ["c", "a"])
         assert stored.shape == (2, 64)
-        np.testing.assert_allclose(stored[0:2], vectors[[2, 0]], atol=1e-3)
+        np.testing.assert_allclose(stored[0:2], vectors[[2, 0]], atol=3e-3)
         assert store.seconds("m", ["a", "b"]) == pytest.approx(0.2)
 
 
-@pytest.mark.parametrize("dim", [512, 4096, 32768])
-def test_float16_changes_inner_products_by_less_than_5e_4(cache: Path, dim: int) -> None:
+@pytest.mark.parametrize(("dim", "most"), [(512, 2e-3), (4096, 1e-3), (32768, 1e-3)])
+def test_a_byte_a_value_changes_inner_products_little(cache: Path, dim: int, most: float) -> None:
     vectors = unit_vectors(40, dim)
     with Store(cache) as store:
         names = [str(i) for i in range(40)]
         store.add_descriptors("m", names, names, vectors, 0)
-        kept = store.read_vectors("m", names).astype(np.float32)
-    assert np.abs(kept @ kept.T - vectors @ vectors.T).max() < 5e-4
+        kept = store.read_vectors("m", names)
+    assert np.abs(kept @ kept.T - vectors @ vectors.T).max() < most
 
 
 def test_only_new_and_changed_photos_are_missing(cache: Path) -> None:
@@ -63,7 +63,7 @@ def test_a_changed_photo_replaces_its_old_descriptor(cache: Path) -> None:
         store.add_descriptors("m", ["a"], ["1"], old[None], 0)
         store.add_descriptors("m", ["a"], ["2"], new[None], 0)
         assert store.described("m") == {"a": "2"}
-        np.testing.assert_allclose(store.read_vectors("m", ["a"])[0], new, atol=1e-3)
+        np.testing.assert_allclose(store.read_vectors("m", ["a"])[0], new, atol=5e-3)
 
 
 def test_equal_basenames_in_different_folders_are_kept_apart(cache: Path) -> None:
@@ -71,7 +71,7 @@ def test_equal_basenames_in_different_folders_are_kept_apart(cache: Path) -> Non
     with Store(cache) as store:
         store.add_descriptors("m", ["east/1.jpg", "west/1.jpg"], ["x", "y"], vectors, 0)
         np.testing.assert_allclose(
-            store.read_vectors("m", ["west/1.jpg"])[0], vectors[1], atol=1e-3
+            store.read_vectors("m", ["west/1.jpg"])[0], vectors[1], atol=5e-3
         )
 
 

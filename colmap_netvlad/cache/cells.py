@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_netvlad.cache.codes import decode, encode
+
 
 @dataclass(frozen=True, eq=False)
 class Cells:
@@ -23,16 +25,11 @@ class Cells:
     @classmethod
     def of(cls, features: NDArray[np.floating]) -> Cells:
         """Encode features (D, h, w) of any length."""
-        largest = np.maximum(np.abs(features).max(axis=0), 1e-12)
-        codes = np.round(127 * features / largest).astype(np.int8)
-        return cls(np.ascontiguousarray(codes.transpose(1, 2, 0)))
+        return cls(encode(np.ascontiguousarray(features.transpose(1, 2, 0))))
 
     def vectors(self) -> NDArray[np.float32]:
         """Return (h w, D) features, L2-normalised; zero where there is no texture."""
-        vectors = self.codes.reshape(-1, self.codes.shape[2]).astype(np.float32)
-        length = np.sqrt(np.einsum("ij,ij->i", vectors, vectors))
-        vectors /= np.maximum(length, 1e-12)[:, None]
-        return vectors
+        return decode(self.codes.reshape(-1, self.codes.shape[2]))
 
     def places(self) -> NDArray[np.float32]:
         """Return (h w, 2) x, y of each feature, in cells."""

@@ -64,6 +64,7 @@ def save_checkpoint(
         "normalisation": model.trunk.normalisation.as_dict(),
         "aggregation": model.aggregation.options(),
         "whitening": None if model.whitening is None else model.whitening.dim,
+        "axes": None if model.axes is None else len(model.axes),
         "dim": model.dim,
         **metadata,
     }
@@ -166,7 +167,8 @@ def _built(path: Path, card: dict[str, Any]) -> GlobalDescriptor:
         trunk = build_trunk(card["backbone"], Normalisation.from_dict(card["normalisation"]))
         aggregation = build_aggregation(trunk.channels, card["aggregation"])
         whitening = Whitening(aggregation.dim, card["whitening"]) if card.get("whitening") else None
-        return GlobalDescriptor(trunk, aggregation, whitening)
+        axes = torch.zeros(card["axes"], trunk.channels) if card.get("axes") else None
+        return GlobalDescriptor(trunk, aggregation, whitening, axes)
     except (KeyError, TypeError, ValueError, RuntimeError) as fault:
         raise InputError(
             f"{path} is a checkpoint with a network this version does not know "
@@ -246,6 +248,7 @@ _RIGHT: dict[str, Callable[[Any], bool]] = {
     "long_side": lambda value: _is_number(value, 16, 2**14),
     "rotations": lambda value: _is_number(value, 1, 4),
     "whitening": lambda value: value is None or _is_number(value, 1, 2**24),
+    "axes": lambda value: value is None or _is_number(value, 1, 2**14),
 }
 """What the values of a card can be."""
 

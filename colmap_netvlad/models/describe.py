@@ -121,9 +121,9 @@ class DescriptorModel:
 
         Returns:
             descriptors: float32 (B, dim), L2-normalised.
-            cells: float32 (B, C, h, w), L2-normalised, the mean over the turns of each
-            place; zero where the photo has no texture (a mask, a black corner), which would look
-            the same in photos that share nothing.
+            cells: float32 (B, A, h, w), L2-normalised, the mean over the turns of each place
+            along the network's A axes; zero where the photo has no texture (a mask, a black
+            corner), which would look the same in photos that share nothing.
         """
         if len(pixels) == 0:
             return np.zeros((0, self.dim), np.float32), np.zeros((0, 0, 0, 0), np.float32)
@@ -148,7 +148,7 @@ class DescriptorModel:
             for first, (_, both) in enumerate(passes)
             for place, local in enumerate(both.split(len(photos)))
         ]
-        local = functional.normalize(torch.stack(upright).mean(dim=0), dim=1)
+        local = self._network.at_places(torch.stack(upright).mean(dim=0))
         return functional.normalize(mean, dim=1), local * has_texture(photos, local.shape[2:])
 
     def _run(self, pixels: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,7 +1,11 @@
-"""A trunk, an aggregation and, where wanted, a whitening: pixels to one global descriptor."""
+"""A trunk, an aggregation and, where wanted, a whitening: pixels to one global descriptor.
+
+Beside it what each place of a photo looks like, along few axes where the network has some.
+"""
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -17,13 +21,22 @@ class GlobalDescriptor(nn.Module):
         trunk: pixels to local features.
         aggregation: local features to one vector.
         whitening: that vector to a shorter one, or None.
+        axes: (A, C), orthonormal principal axes of the local features, along which cells are
+            kept (`at_places`); None keeps all C values.
         dim: D, length of the descriptor.
     """
 
+    axes: Tensor | None
+
     def __init__(
-        self, trunk: Trunk, aggregation: Aggregation, whitening: Whitening | None = None
+        self,
+        trunk: Trunk,
+        aggregation: Aggregation,
+        whitening: Whitening | None = None,
+        axes: Tensor | None = None,
     ) -> None:
         super().__init__()
+        self.register_buffer("axes", axes)
         self.trunk = trunk
         self.aggregation = aggregation
         self.whitening = whitening
@@ -52,3 +65,12 @@ class GlobalDescriptor(nn.Module):
         if self.whitening is not None:
             descriptors = self.whitening(descriptors)
         return descriptors, local.unflatten(2, features.shape[2:])
+
+    def at_places(self, local: Tensor) -> Tensor:
+        """Local features (B, C, h, w) to what is compared place by place (B, A, h, w).
+
+        L2-normalised; the same for features of any length.
+        """
+        if self.axes is not None:
+            local = torch.einsum("ac,bchw->bahw", self.axes.float(), local)
+        return functional.normalize(local, dim=1)

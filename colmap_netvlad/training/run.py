@@ -391,7 +391,9 @@ class Run:
     def _build(self, saved: dict[str, Any] | None) -> GlobalDescriptor:
         options = self.options
         if options.start is not None:
-            return load_network(options.start)
+            network = load_network(options.start)
+            network.axes = None  # they are of the features before (`scripts/make_axes.py`)
+            return network
         trunk = load_trunk(options.trunk, Path(options.weights) if options.weights else None)
         kind = {"kind": options.aggregation}
         clusters = {"clusters": options.clusters} if "netvlad" in options.aggregation else {}

@@ -74,7 +74,7 @@ def export(flight: Flight, options: RetrievalOptions, model: str | Path, file: P
         for first in range(0, len(names), WRITE_ROWS):
             block = names[first : first + WRITE_ROWS]
             for name, vector in zip(block, store.read_vectors(key, block), strict=True):
-                content.create_group(name).create_dataset(DATASET, data=vector)
+                content.create_group(name).create_dataset(DATASET, data=np.float16(vector))
 
 
 class _Rows:
