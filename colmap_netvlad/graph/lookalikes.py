@@ -16,8 +16,10 @@ photos have matches with their true neighbours but none with each other (Zach, I
 Bischof, "What can missing correspondences tell us about 3D structure and motion?", CVPR 2008).
 Pairs that lack much count little in the fit, and only such pairs are contradicted by cycles.
 
-Pairs that do not look the same way, or whose matches no similarity fits (facades, orbits), are
-not judged: nothing is said of them and nothing dropped.
+Pairs that do not look the same way, or whose matches no similarity fits, say nothing of the plan.
+Weak look-alikes are often such pairs: a few matches of each of several copies. Where other pairs,
+or GPS, put both photos too far apart to have ground in common, such a pair is contradicted.
+Flights of which many pairs are so (facades, orbits) have no plan, and nothing is said of them.
 
 The two steps of the fit, turns and heights first and places then, each least squares repeated
 with robust weights, follow motion averaging as in Chatterjee and Govindu, "Efficient and robust
@@ -55,6 +57,10 @@ LOOSE = 0.05
 
 BESIDE = 0.35
 """A pair this far beside the plan is contradicted, image widths on the ground."""
+
+APART = 1.5
+"""Photos whose places on the ground are this far from each other have none of it in common, image
+widths: the diagonal of a photo is 1.25 of them, 1.4 where it is a square."""
 
 JUDGED = 0.8
 """Share of the verified pairs that must be judged, else the photos are no flight that looks one
@@ -350,6 +356,7 @@ def judge_moves(moves: Moves, positions: Mapping[str, NDArray[np.float64]]) -> l
     plan = fit_plan(moves)
     by_gps = _against_gps(moves, plan, positions)
     trusted = _agreed(moves, plan.beside / BESIDE)
+    apart = _apart(moves, plan, by_gps) if trusted else np.full(len(moves.edges), np.nan)
     found = []
     for e, (i, j) in enumerate(moves.edges.tolist()):
         pair, inliers = as_pair(moves.names[i], moves.names[j]), int(moves.inliers[e])
@@ -371,6 +378,13 @@ def judge_moves(moves: Moves, positions: Mapping[str, NDArray[np.float64]]) -> l
             over = plan.beside[e] / BESIDE
             found.append(Lookalike(pair, inliers, reason, True, float(over)))
             continue
+        elif apart[e] > APART and moves.filled[e] < LACKING:
+            reason = (
+                f"Its matches fit no shift, and what is known of its photos puts them "
+                f"{apart[e]:.1f} photo widths apart: they have no ground in common."
+            )
+            found.append(Lookalike(pair, inliers, reason, True, float(apart[e] / APART)))
+            continue
         if moves.cover[e] < CROWDED and not moves.filled[e] >= LACKING:
             reason = f"Its matches crowd on {100 * moves.cover[e]:.1f} % of the photo."
             found.append(
@@ -382,11 +396,18 @@ def judge_moves(moves: Moves, positions: Mapping[str, NDArray[np.float64]]) -> l
 
 @dataclass(frozen=True, eq=False)
 class _Distances:
-    """How far apart matches and GPS put the photos of each pair, m; NaN where it is not judged."""
+    """How far apart matches and GPS put the photos of each pair, m; NaN where it is not judged.
+
+    Attributes:
+        matched, known: by its matches, by GPS.
+        limit: of their difference.
+        width: an image width on the ground, m; NaN where GPS says nothing.
+    """
 
     matched: Floats
     known: Floats
     limit: Floats
+    width: Floats
 
     @property
     def error(self) -> Floats:
@@ -407,16 +428,36 @@ def _against_gps(
     usable = moves.judged & np.isfinite(known) & np.isfinite(moved)
     far = usable & (np.abs(moves.shift) > 0.1 * moves.widths[j])
     if far.sum() < 3:
-        return _Distances(nothing, nothing, nothing)
+        return _Distances(nothing, nothing, nothing, nothing)
     metre = float(np.median(known[far] / moved[far]))  # metres of one unit of the plan
     matched = metre * moved
     limit = np.maximum(GPS_ERROR, BESIDE * metre * size * moves.widths[j])
     limit = np.where(usable, limit, np.nan)
     over = np.abs(matched - known) / limit
     if not _agreed(moves, over):
-        return _Distances(nothing, nothing, nothing)
+        return _Distances(nothing, nothing, nothing, nothing)
     wild = _wild_positions(moves, plan, over)
-    return _Distances(matched, known, np.where(wild[i] | wild[j], np.nan, limit))
+    said = np.where(wild[i] | wild[j], np.nan, 1.0)
+    width = metre * np.maximum(size, np.abs(plan.turns[i])) * moves.widths[j]
+    return _Distances(matched, known, limit * said, width * said)
+
+
+def _apart(moves: Moves, plan: Plan, by_gps: _Distances) -> Floats:
+    """Return (E) how far apart the photos of pairs are that are not judged, image widths.
+
+    It is NaN where neither GPS nor the plan says it: where no pairs that lie close to the plan and
+    lack nothing join both photos.
+    """
+    i, j = moves.edges.T
+    sound = moves.judged & (plan.beside <= BESIDE) & (moves.filled >= LACKING)
+    count = len(moves.names)
+    ends = tuple(moves.edges[sound].T.astype(np.int32))
+    joined = sparse.coo_array((np.ones(sound.sum()), ends), shape=(count, count))
+    _, part = connected_components(joined, directed=False)
+    width = np.maximum(*(np.abs(plan.turns[k]) * moves.widths[k] for k in (i, j)))
+    on_plan = np.where(part[i] == part[j], np.abs(plan.places[i] - plan.places[j]) / width, np.nan)
+    on_gps = by_gps.known / by_gps.width
+    return np.where(moves.judged, np.nan, np.where(np.isfinite(on_gps), on_gps, on_plan))
 
 
 def _wild_positions(moves: Moves, plan: Plan, over: Floats) -> NDArray[np.bool_]:
