@@ -15,6 +15,7 @@ from colmap_netvlad.colmap.database import image_names, open_database, pair_id
 from colmap_netvlad.demo.landscape import ESTATE_STEP, Extent, Landscape
 from colmap_netvlad.demo.simulate import FLYING_HEIGHT, SimulationOptions, simulate_flight
 from colmap_netvlad.graph.lookalikes import (
+    APART,
     Moves,
     find_lookalikes,
     fit_plan,
@@ -123,6 +124,40 @@ def test_gps_of_another_flight_contradicts_nothing():
     shuffled = dict(zip(metres, rng.permutation(list(metres.values())), strict=True))
     assert judge_moves(moves, metres) == []
     assert not any(one.contradicted for one in judge_moves(moves, shuffled))
+
+
+def test_pairs_that_fit_no_shift_are_judged_by_where_others_put_their_photos():
+    moves, metres, wrong = flight_moves(wrong=15)
+    mixed = moves.misfit.copy()
+    mixed[list(wrong)] = 0.2
+    near = [e for e in range(len(moves.edges)) if e not in wrong][:4]
+    mixed[near] = 0.2  # true ones of which a similarity tells nothing either
+    mixed = replace(moves, misfit=mixed, filled=np.where(mixed > 0.1, 0.3, moves.filled))
+    places = np.array(list(metres.values()))
+    gap = np.linalg.norm(places[moves.edges[:, 0]] - places[moves.edges[:, 1]], axis=1)
+    far = {e for e in wrong if gap[e] > 1.1 * 100 * APART * WIDTH}  # heights differ by a tenth
+    assert len(far) > 5
+    for positions in ({}, metres):
+        found = [one for one in judge_moves(mixed, positions) if one.contradicted]
+        assert pairs_of(moves, far) <= {one.pair for one in found} <= pairs_of(moves, wrong)
+        assert all("no ground in common" in one.reason for one in found)
+
+
+def test_parts_that_only_such_pairs_join_are_not_contradicted():
+    one, _, _ = flight_moves(wrong=0)
+    count = len(one.names)
+    bridges = np.array([(k, count + (k + 20) % count) for k in range(0, count, 5)])
+    edges = np.concatenate([one.edges, one.edges + count, bridges])
+    both = {
+        name: np.concatenate([getattr(one, name)] * 2 + [np.full(len(bridges), value)])
+        for name, value in {
+            "inliers": 60, "turn": 1, "shift": 0.1, "misfit": 0.3, "tilt": 2.0, "cover": 0.5,
+            "filled": 0.3,
+        }.items()
+    }  # fmt: skip
+    names = (*one.names, *(f"b{name}" for name in one.names))
+    moves = Moves(names=names, edges=edges, widths=np.full(2 * count, WIDTH), **both)
+    assert not any(one.contradicted for one in judge_moves(moves, {}))
 
 
 def test_facades_and_orbits_are_not_judged():
