@@ -127,7 +127,7 @@ def test_gps_of_another_flight_contradicts_nothing():
 
 
 def test_pairs_that_fit_no_shift_are_judged_by_where_others_put_their_photos():
-    moves, metres, wrong = flight_moves(wrong=15)
+    moves, metres, wrong = flight_moves(side=10, wrong=30)
     mixed = moves.misfit.copy()
     mixed[list(wrong)] = 0.2
     near = [e for e in range(len(moves.edges)) if e not in wrong][:4]
