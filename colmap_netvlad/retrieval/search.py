@@ -159,10 +159,15 @@ def _reduced(vectors: Vectors | NDArray[np.floating], k: int) -> Neighbours:
 
 
 def _spread(vectors: Vectors | NDArray[np.floating], count: int) -> NDArray[np.float32]:
-    """Return at most `count` rows, an equal share of each block's."""
-    step = max(-(-vectors.shape[0] // count), 1)
-    rows = [_load(vectors, part)[-part.start % step :: step] for part in _blocks_of(vectors)]
-    return np.concatenate(rows)
+    """Return at most `count` rows, spread over all."""
+    total, dim = vectors.shape
+    chosen = np.arange(0, total, max(-(-total // count), 1))
+    sample = np.empty((len(chosen), dim), np.float32)
+    for part in _blocks_of(vectors):
+        first, last = np.searchsorted(chosen, [part.start, part.stop])
+        # Copied into the sample: views would keep whole blocks, and so all descriptors, in memory.
+        sample[first:last] = _load(vectors, part)[chosen[first:last] - part.start]
+    return sample
 
 
 def _principal_axes(sample: NDArray[np.float32], count: int) -> NDArray[np.float32]:
