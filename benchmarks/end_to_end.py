@@ -225,7 +225,7 @@ def show(output: Path) -> None:
     axes = figure.subplots()
     for stage in STAGES:
         done = [n for n in sizes if all_figures[n].get(stage, {}).get("done")]
-        if done and stage not in CHECKS:
+        if done and stage not in (*CHECKS, "tree"):  # which is made once, for all sizes
             seconds = [all_figures[n][stage]["cpu"] for n in done]
             axes.plot(done, seconds, "o-", label=stage, markersize=4)
     if sizes:
