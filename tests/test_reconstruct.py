@@ -131,7 +131,8 @@ def test_an_interrupted_mapping_leaves_no_trace(
     with pytest.raises(KeyboardInterrupt):
         map_matched(project)
     after = {path.name for path in project.folder.iterdir()}
-    assert {name for name in after - before if not name.endswith(("-wal", "-shm"))} == set()
+    kept = {project.cache.name}  # positions of the photos, read to tell look-alikes
+    assert {name for name in after - before if not name.endswith(("-wal", "-shm"))} <= kept
 
 
 def test_a_given_output_that_exists_is_left_alone(
