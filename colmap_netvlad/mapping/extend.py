@@ -7,12 +7,9 @@ from pathlib import Path
 
 import pycolmap
 
-from colmap_netvlad.colmap import engine
-from colmap_netvlad.mapping.options import MappingOptions, pipeline_options
+from colmap_netvlad.mapping.incremental import register
+from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.mapping.output import Finish, as_mapped, model_folder, numbered
-from colmap_netvlad.mapping.priors import with_priors
-from colmap_netvlad.mapping.settle import settle
-from colmap_netvlad.runtime import progress
 from colmap_netvlad.runtime.errors import InputError
 
 
@@ -76,27 +73,8 @@ def extend_model(
         InputError: no model there, or `output` holds something already.
     """
     read_model(model)
-    pipeline = pipeline_options(options, colors=images is not None)
-    pipeline.multiple_models = False
     with model_folder(output) as folder:
-        # Continuing a model, COLMAP writes straight into its output folder.
-        extended = folder / "0"
-        extended.mkdir()
-        with (
-            with_priors(database, options.priors, folder.parent) as source,
-            progress.step("Registering images", candidates) as bar,
-        ):
-            engine.call(
-                pycolmap.incremental_mapping,
-                folder,
-                source,
-                images or folder,
-                extended,
-                options=pipeline,
-                input_path=model,
-                next_image_callback=bar.advance,
-            )
-        settle(database, folder, options)
-        result = pycolmap.Reconstruction(extended)
+        register(database, images, folder, candidates, options, model)
+        result = pycolmap.Reconstruction(folder / "0")
         finish(folder)
     return result

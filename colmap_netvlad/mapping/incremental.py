@@ -40,21 +40,43 @@ def map_incremental(
     with open_database(database) as colmap:
         total = len(colmap.keypoint_counts())
     with model_folder(output) as folder:
-        with (
-            with_priors(database, options.priors, folder.parent) as source,
-            progress.step("Registering images", total) as bar,
-        ):
+        register(database, images, folder, total, options)
+        models = [pycolmap.Reconstruction(path) for path in numbered(folder)]
+        finish(folder)
+    return models
+
+
+def register(
+    database: Path,
+    images: Path | None,
+    folder: Path,
+    total: int,
+    options: MappingOptions,
+    model: Path | None = None,
+) -> None:
+    """Let COLMAP register images into `folder`/0, 1, ..., and adjust once more with positions.
+
+    Args:
+        total: images that may be registered, for the progress bar.
+        model: folder of the model to continue, into `folder`/0; None: begin anew.
+    """
+    pipeline = pipeline_options(options, colors=images is not None)
+    target = folder
+    if model is not None:
+        # Continuing a model, COLMAP writes straight into its output folder.
+        pipeline.multiple_models, target = False, folder / "0"
+        target.mkdir()
+    with with_priors(database, options.priors, folder.parent) as source:
+        with progress.step("Registering images", total) as bar:
             engine.call(
                 pycolmap.incremental_mapping,
                 folder,
                 source,
                 images or folder,
-                folder,
-                options=pipeline_options(options, colors=images is not None),
+                target,
+                options=pipeline,
+                input_path=model or "",
                 initial_image_pair_callback=lambda: bar.advance(2),
                 next_image_callback=bar.advance,
             )
-        settle(database, folder, options)
-        models = [pycolmap.Reconstruction(path) for path in numbered(folder)]
-        finish(folder)
-    return models
+        settle(source, folder, options)

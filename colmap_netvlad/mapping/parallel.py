@@ -29,7 +29,7 @@ from colmap_netvlad.mapping.output import Finish, as_mapped, model_folder, numbe
 from colmap_netvlad.mapping.partition import Cluster, partition
 from colmap_netvlad.mapping.priors import with_priors, write_priors
 from colmap_netvlad.mapping.refine import load_cache, rebuild, refine
-from colmap_netvlad.mapping.settle import settle
+from colmap_netvlad.mapping.settle import settle_model
 from colmap_netvlad.runtime import progress, workers
 from colmap_netvlad.runtime.errors import InputError
 from colmap_netvlad.runtime.files import write_atomically
@@ -141,7 +141,6 @@ def reconstruct_parallel(
         state = open_state(output, graph, clusters, options)
         report = map_clusters(database, clusters, state, options)
         merge_clusters(database, images, state, folder, options, report)
-        settle(database, folder, options)
         models = [pycolmap.Reconstruction(path) for path in numbered(folder)]
         finish(folder)
     forget_clusters(output)
@@ -372,6 +371,7 @@ def merge_models(
         have |= registered
         if images is not None:
             reconstruction.extract_colors_for_all_images(images)
+        settle_model(reconstruction, cache, options)
         target = folder / str(len(members))
         target.mkdir()
         reconstruction.write(target)

@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 from colmap_netvlad.colmap import engine
 from colmap_netvlad.mapping.options import MappingOptions, pipeline_options
 from colmap_netvlad.mapping.output import numbered
-from colmap_netvlad.mapping.priors import LOSS_SCALE, PositionPriors, with_priors
+from colmap_netvlad.mapping.priors import LOSS_SCALE, PositionPriors
 from colmap_netvlad.mapping.refine import adjust_robustly, load_cache
 from colmap_netvlad.runtime import progress, workers
 from colmap_netvlad.runtime.errors import InputError
@@ -41,7 +41,7 @@ def settle(database: Path, folder: Path, options: MappingOptions) -> None:
     It runs in a worker, so that Ctrl-C ends it at once.
 
     Args:
-        database: COLMAP database that the models were mapped from.
+        database: that the models were mapped from, with the positions (`priors.with_priors`).
         folder: of models 0, 1, ..., in the frame of the positions.
         options: threads, and the positions.
 
@@ -52,7 +52,7 @@ def settle(database: Path, folder: Path, options: MappingOptions) -> None:
     if options.priors is None or not models:
         return
     with progress.step("Adjusting with positions", len(models)) as bar:
-        job = workers.Job(settle_models, (database, folder, models, options))
+        job = workers.Job(settle_models, (database, models, options))
         (outcome,) = workers.run([job], 1, bar.advance, initialiser=engine.initialiser())
     if outcome.fault is not None:
         raise InputError(
@@ -61,29 +61,32 @@ def settle(database: Path, folder: Path, options: MappingOptions) -> None:
 
 
 def settle_models(
-    advance: Callable[[int], None],
-    database: Path,
-    folder: Path,
-    models: list[Path],
-    options: MappingOptions,
+    advance: Callable[[int], None], database: Path, models: list[Path], options: MappingOptions
 ) -> None:
     """Adjust models and write them again (in a worker)."""
-    assert options.priors is not None
-    with with_priors(database, options.priors, folder) as source:
-        cache = load_cache(source)
-    pipeline = pipeline_options(options, colors=False)
+    cache = load_cache(database)
     for path in models:
         model = pycolmap.Reconstruction(path)
-        mapper = pycolmap.IncrementalMapper(cache)
-        mapper.begin_reconstruction(model)
-        # Convex, so that nothing is lost by where it starts; COLMAP's own for local adjustments.
-        adjust_robustly(mapper, pipeline, pycolmap.LossFunctionType.SOFT_L1)
-        mapper.filter_points(pipeline.get_mapper())
-        mapper.end_reconstruction(False)
-        model.transform(best_similarity(model, options.priors))
-        model.update_point_3d_errors()
+        settle_model(model, cache, options)
         model.write(path)
         advance(1)
+
+
+def settle_model(
+    model: pycolmap.Reconstruction, cache: pycolmap.DatabaseCache, options: MappingOptions
+) -> None:
+    """Adjust one model, in place; do nothing without positions."""
+    if options.priors is None:
+        return
+    pipeline = pipeline_options(options, colors=False)
+    mapper = pycolmap.IncrementalMapper(cache)
+    mapper.begin_reconstruction(model)
+    # Convex, so that nothing is lost by where it starts; COLMAP's own for local adjustments.
+    adjust_robustly(mapper, pipeline, pycolmap.LossFunctionType.SOFT_L1)
+    mapper.filter_points(pipeline.get_mapper())
+    mapper.end_reconstruction(False)
+    model.transform(best_similarity(model, options.priors))
+    model.update_point_3d_errors()
 
 
 def best_similarity(model: pycolmap.Reconstruction, priors: PositionPriors) -> pycolmap.Sim3d:
