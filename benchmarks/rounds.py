@@ -29,7 +29,7 @@ from colmap_netvlad.graph.verified import CORRECT_MATCHES
 from colmap_netvlad.matching.blocks import Photos
 from colmap_netvlad.matching.guided import Stage, match
 from colmap_netvlad.matching.run import in_tiles
-from colmap_netvlad.pairs.rounds import FITTED, next_round, replay, split_budget
+from colmap_netvlad.pairs.rounds import FITTED, replay
 from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval.fusion import similarity_matrix
 from colmap_netvlad.retrieval.options import RetrievalOptions
@@ -75,13 +75,7 @@ def unpaid(project: Project, methods: list[str], ks: list[int], options: Retriev
         for k in ks:
             budget, cells = len(one_round(ranking, k)), []
             for free in (set[IndexPair](), given_up):
-                tested: dict[IndexPair, int] = {}
-                allowed = 0
-                for size in split_budget(budget, ROUNDS):
-                    allowed += size
-                    room = allowed - len(tested.keys() - free)
-                    chosen = next_round(similarity, tested, names, room, weights)
-                    tested.update((pair, truth.get(pair, 0)) for pair in chosen)
+                *_, tested = replay(similarity, truth, names, budget, ROUNDS, weights, free)
                 recall = correct(set(tested), truth) / total
                 cells += [f"{len(tested):,}", f"{len(given_up & tested.keys())}", f"{recall:.1%}"]
             print(f"| {method} | {budget:,} | {' | '.join(cells)} |", flush=True)

@@ -11,7 +11,7 @@ images; pairs are index pairs with the lower index first.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence, Set
 from dataclasses import astuple, dataclass
 
 import numpy as np
@@ -194,11 +194,13 @@ def replay(
     budget: int,
     rounds: int,
     weights: Weights = FITTED[False],
+    unpaid: Set[IndexPair] = frozenset(),
 ) -> Iterator[dict[IndexPair, int]]:
     """Play rounds on a flight whose every pair is matched already; nothing is matched.
 
     Args:
         truth: verified matches of all pairs; absent pairs have none.
+        unpaid: pairs that do not count against the budget.
 
     Yields:
         After each round the verified matches of all pairs tested so far.
@@ -207,7 +209,8 @@ def replay(
     allowed = 0
     for size in split_budget(budget, rounds):
         allowed += size
-        chosen = next_round(similarity, tested, names, allowed - len(tested), weights)
+        room = allowed - len(tested.keys() - unpaid)
+        chosen = next_round(similarity, tested, names, room, weights)
         tested.update((pair, truth.get(pair, 0)) for pair in chosen)
         yield dict(tested)
 
