@@ -356,36 +356,34 @@ def judge_moves(moves: Moves, positions: Mapping[str, NDArray[np.float64]]) -> l
     plan = fit_plan(moves)
     by_gps = _against_gps(moves, plan, positions)
     trusted = _agreed(moves, plan.beside / BESIDE)
-    apart = _apart(moves, plan, by_gps) if trusted else np.full(len(moves.edges), np.nan)
+    beside = plan.beside if trusted else np.full(len(moves.edges), np.nan)
+    apart = _apart(moves, plan, by_gps) if trusted else beside
     found = []
     for e, (i, j) in enumerate(moves.edges.tolist()):
         pair, inliers = as_pair(moves.names[i], moves.names[j]), int(moves.inliers[e])
+        over, reason = 0.0, ""
         if np.isfinite(by_gps.limit[e]):
             over = by_gps.error[e] / by_gps.limit[e]
-            if over > 1:
-                reason = (
-                    f"Its matches put the photos {by_gps.matched[e]:,.0f} m apart, GPS "
-                    f"{by_gps.known[e]:,.0f} m."
-                )
-                found.append(Lookalike(pair, inliers, reason, True, float(over)))
-                continue
-        elif trusted and plan.beside[e] > BESIDE and moves.filled[e] < LACKING:
             reason = (
-                f"It lies {plan.beside[e]:.1f} photo widths beside the plan that the pairs around "
+                f"Its matches put the photos {by_gps.matched[e]:,.0f} m apart, GPS "
+                f"{by_gps.known[e]:,.0f} m."
+            )
+        elif beside[e] > BESIDE and moves.filled[e] < LACKING:
+            over = beside[e] / BESIDE
+            reason = (
+                f"It lies {beside[e]:.1f} photo widths beside the plan that the pairs around "
                 f"it agree on, and lacks matches in {100 * (1 - moves.filled[e]):.0f} % of what "
                 "both photos would see."
             )
-            over = plan.beside[e] / BESIDE
-            found.append(Lookalike(pair, inliers, reason, True, float(over)))
-            continue
         elif apart[e] > APART and moves.filled[e] < LACKING:
+            over = apart[e] / APART
             reason = (
                 f"Its matches fit no shift, and what is known of its photos puts them "
                 f"{apart[e]:.1f} photo widths apart: they have no ground in common."
             )
-            found.append(Lookalike(pair, inliers, reason, True, float(apart[e] / APART)))
-            continue
-        if moves.cover[e] < CROWDED and not moves.filled[e] >= LACKING:
+        if over > 1:
+            found.append(Lookalike(pair, inliers, reason, True, float(over)))
+        elif moves.cover[e] < CROWDED and not moves.filled[e] >= LACKING:
             reason = f"Its matches crowd on {100 * moves.cover[e]:.1f} % of the photo."
             found.append(
                 Lookalike(pair, inliers, reason, False, CROWDED / max(moves.cover[e], 1e-6))
@@ -401,13 +399,13 @@ class _Distances:
     Attributes:
         matched, known: by its matches, by GPS.
         limit: of their difference.
-        width: an image width on the ground, m; NaN where GPS says nothing.
+        metre: metres of one unit of the plan; NaN where GPS says nothing.
     """
 
     matched: Floats
     known: Floats
     limit: Floats
-    width: Floats
+    metre: float
 
     @property
     def error(self) -> Floats:
@@ -428,18 +426,17 @@ def _against_gps(
     usable = moves.judged & np.isfinite(known) & np.isfinite(moved)
     far = usable & (np.abs(moves.shift) > 0.1 * moves.widths[j])
     if far.sum() < 3:
-        return _Distances(nothing, nothing, nothing, nothing)
-    metre = float(np.median(known[far] / moved[far]))  # metres of one unit of the plan
+        return _Distances(nothing, nothing, nothing, np.nan)
+    metre = float(np.median(known[far] / moved[far]))
     matched = metre * moved
     limit = np.maximum(GPS_ERROR, BESIDE * metre * size * moves.widths[j])
     limit = np.where(usable, limit, np.nan)
     over = np.abs(matched - known) / limit
     if not _agreed(moves, over):
-        return _Distances(nothing, nothing, nothing, nothing)
+        return _Distances(nothing, nothing, nothing, np.nan)
     wild = _wild_positions(moves, plan, over)
     said = np.where(wild[i] | wild[j], np.nan, 1.0)
-    width = metre * np.maximum(size, np.abs(plan.turns[i])) * moves.widths[j]
-    return _Distances(matched, known, limit * said, width * said)
+    return _Distances(matched, known * said, limit * said, metre)
 
 
 def _apart(moves: Moves, plan: Plan, by_gps: _Distances) -> Floats:
@@ -456,7 +453,7 @@ def _apart(moves: Moves, plan: Plan, by_gps: _Distances) -> Floats:
     _, part = connected_components(joined, directed=False)
     width = np.maximum(*(np.abs(plan.turns[k]) * moves.widths[k] for k in (i, j)))
     on_plan = np.where(part[i] == part[j], np.abs(plan.places[i] - plan.places[j]) / width, np.nan)
-    on_gps = by_gps.known / by_gps.width
+    on_gps = by_gps.known / by_gps.metre / width
     return np.where(moves.judged, np.nan, np.where(np.isfinite(on_gps), on_gps, on_plan))
 
 
