@@ -12,8 +12,10 @@ from click.testing import CliRunner
 
 from colmap_netvlad.cli import cli
 from colmap_netvlad.colmap.database import image_names, open_database, pair_id
+from colmap_netvlad.commands.reconstruct import reconstruct
 from colmap_netvlad.demo.landscape import ESTATE_STEP, Extent, Landscape
 from colmap_netvlad.demo.simulate import FLYING_HEIGHT, SimulationOptions, simulate_flight
+from colmap_netvlad.graph import lookalikes
 from colmap_netvlad.graph.lookalikes import (
     APART,
     Moves,
@@ -24,6 +26,7 @@ from colmap_netvlad.graph.lookalikes import (
 )
 from colmap_netvlad.graph.pair import as_pair
 from colmap_netvlad.graph.verified import verified_by_name
+from colmap_netvlad.mapping import contradicted
 from colmap_netvlad.mapping.contradicted import contradicted_pairs
 
 WIDTH = 1.25
@@ -247,6 +250,22 @@ def test_dropped_pairs_stay_in_the_database_and_out_of_the_model(project_copy, f
     assert f"{pair[0]} – {pair[1]}" in page
     run = CliRunner().invoke(cli, ["report", "--sparse", str(project.sparse)])
     assert run.exit_code == 0, run.output
+
+
+def test_reconstruct_and_its_report_read_the_pairs_once(project_copy, monkeypatch):
+    project = project_copy(matched=True)
+    names = image_names(project.database)
+    pairs = [(a, b) for a in names for b in names if a < b]
+    reads = []
+
+    def counted(database):
+        reads.append(database)
+        return read_moves(database)
+
+    for module in (lookalikes, contradicted):
+        monkeypatch.setattr(module, "read_moves", counted)
+    assert reconstruct(project, pairs).quality
+    assert len(reads) == 1
 
 
 def test_copies_are_alike_to_the_last_tile():

@@ -27,7 +27,7 @@ from colmap_netvlad.commands.report import (
 from colmap_netvlad.geo.georeference import Place, read_place
 from colmap_netvlad.geo.places import find_deviations, find_places
 from colmap_netvlad.graph.pair import Pair
-from colmap_netvlad.mapping.contradicted import dropped_lines, mapping_database
+from colmap_netvlad.mapping.contradicted import dropped_lines, mapping_database, moves_of
 from colmap_netvlad.mapping.extend import extend_model, largest_model, read_model
 from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.mapping.output import free_output
@@ -187,6 +187,7 @@ def add_photos(
         save_runs(models, replace(run, seconds=seconds, dropped=len(dropped)))
 
     remove_scratch(project.folder)  # the copy that a stopped run mapped from
+    moves = None
     made = made_before(output or project.sparse, run) if begun.photos else None
     target = made or free_output(output or project.sparse)
     _remember(project, Begun(new, str(model), str(target.absolute())))
@@ -195,9 +196,10 @@ def add_photos(
         seconds["mapping"] = 0.0
     else:
         mapping = MappingOptions(seed=options.seed, priors=priors)
-        with mapping_database(project, options.drop_contradicted) as (kept, dropped):
+        moves = moves_of(project) if options.drop_contradicted else None
+        with mapping_database(project, moves) as (kept, dropped):
             after = extend_model(kept, folder, model, target, len(usable), mapping, finish)
-    quality = report_models(target, project.database, folder)
+    quality = report_models(target, project.database, folder, moves)
     registered = registered_names([after])
     _remember(project, Begun())
     return AddReport(

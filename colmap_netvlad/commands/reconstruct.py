@@ -38,7 +38,7 @@ from colmap_netvlad.geo.gcp import ControlList
 from colmap_netvlad.geo.places import Places, find_deviations, find_places
 from colmap_netvlad.graph.pair import Pair
 from colmap_netvlad.mapping import MAPPERS, WITH_PRIORS
-from colmap_netvlad.mapping.contradicted import dropped_lines, mapping_database
+from colmap_netvlad.mapping.contradicted import dropped_lines, mapping_database, moves_of
 from colmap_netvlad.mapping.extend import read_models
 from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.mapping.output import free_output
@@ -171,6 +171,7 @@ def reconstruct(
         save_runs(folder, replace(run, seconds=seconds, dropped=len(dropped)))
 
     remove_scratch(project.folder)  # the copy that a stopped run mapped from
+    moves = None
     target = made_before(output or project.sparse, run)
     if target is not None and not all_reported(target):
         models = read_models(target)
@@ -179,14 +180,15 @@ def reconstruct(
     else:
         target = free_output(output or project.sparse)
         mapper = MAPPERS[options.mapper]
-        with mapping_database(project, options.drop_contradicted) as (database, dropped):
+        moves = moves_of(project) if options.drop_contradicted else None
+        with mapping_database(project, moves) as (database, dropped):
             models = mapper(database, project.images, target, mapping, finish)
     if not models:
         raise InputError(
             f"No model came out of {matches.verified} verified pairs: none has enough inliers and "
             "baseline to start from. More pairs (`k`) or more overlap may help."
         )
-    quality = report_models(target, project.database, project.images)
+    quality = report_models(target, project.database, project.images, moves)
     registered = registered_names(models)
     names = image_names(project.database)
     return ReconstructReport(

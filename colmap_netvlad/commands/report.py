@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from colmap_netvlad.colmap.database import image_names, open_database
 from colmap_netvlad.colmap.positions import find_priors
 from colmap_netvlad.geo.georeference import FILE as GEOREFERENCE
+from colmap_netvlad.graph.lookalikes import Moves
 from colmap_netvlad.mapping.extend import largest_model, read_model
 from colmap_netvlad.mapping.output import outputs
 from colmap_netvlad.photos.positions import place
@@ -120,8 +121,12 @@ def write_report(
     database: Path | None,
     images: Path | None,
     output: Path | None = None,
+    moves: Moves | None = None,
 ) -> FlightReport:
     """Write the report of a model that lies in `folder` (see `report`).
+
+    Args:
+        moves: of the database's pairs, where they were read before.
 
     Raises:
         InputError: the database cannot be read, or the page not be written.
@@ -136,6 +141,7 @@ def write_report(
         elsewhere=_elsewhere(model, folder),
         run=read_run(folder),
         ground=read_ground_points(folder),
+        moves=moves,
     )
     quality = measure(source)
     checks = judge(quality)
@@ -275,18 +281,23 @@ def _name(folder: Path, database: Path | None) -> str:
     return workspace.name or str(folder)
 
 
-def report_models(output: Path, database: Path, images: Path | None) -> list[FlightReport]:
+def report_models(
+    output: Path, database: Path, images: Path | None, moves: Moves | None = None
+) -> list[FlightReport]:
     """Write the report of every model of a run, each into its folder, the largest first.
 
     A report that cannot be written is no reason to lose a model: the fault is said, and the
     others are written.
+
+    Args:
+        moves: of the database's pairs, where they were read before.
     """
     found = [(read_model(folder), folder) for folder in _models_in(output)]
     found.sort(key=lambda item: -item[0].num_reg_images())
     reports = []
     for model, folder in found:
         try:
-            reports.append(write_report(model, folder, database, images))
+            reports.append(write_report(model, folder, database, images, moves=moves))
         except InputError as fault:
             logger.warning("No quality report of %s: %s", folder, fault.message)
     return reports

@@ -339,16 +339,18 @@ def _cover(pixels: NDArray[np.float32], camera: pycolmap.Camera) -> float:
 
 
 def find_lookalikes(
-    database: Database, positions: Mapping[str, NDArray[np.float64]] | None = None
+    database: Database,
+    positions: Mapping[str, NDArray[np.float64]] | None = None,
+    moves: Moves | None = None,
 ) -> list[Lookalike]:
     """Return the verified pairs that something speaks against, the strongest case first.
 
     Args:
         positions: known positions by image name: east, north, up, m. Where both photos of a pair
             have one that fits the plan, GPS decides alone, as it does not drift.
+        moves: of the database's pairs, where they were read before (`read_moves`).
     """
-    moves = read_moves(database)
-    return judge_moves(moves, positions or {})
+    return judge_moves(moves or read_moves(database), positions or {})
 
 
 def judge_moves(moves: Moves, positions: Mapping[str, NDArray[np.float64]]) -> list[Lookalike]:

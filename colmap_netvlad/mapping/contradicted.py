@@ -7,22 +7,32 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from colmap_netvlad.colmap.copies import copy_with_pairs
+from colmap_netvlad.colmap.database import open_database
 from colmap_netvlad.flight import open_flight
-from colmap_netvlad.graph.lookalikes import find_lookalikes
+from colmap_netvlad.graph.lookalikes import Moves, find_lookalikes, read_moves
 from colmap_netvlad.graph.pair import Pair
 from colmap_netvlad.graph.verified import verified_by_name
 from colmap_netvlad.project import Project
 from colmap_netvlad.runtime.files import scratch_folder
 
 
+def moves_of(project: Project) -> Moves:
+    """Return what the matches of each pair tell, which takes longer than to judge by it."""
+    with open_database(project.database) as database:
+        return read_moves(database)
+
+
 @contextmanager
-def mapping_database(project: Project, drop: bool) -> Iterator[tuple[Path, list[Pair]]]:
+def mapping_database(project: Project, moves: Moves | None) -> Iterator[tuple[Path, list[Pair]]]:
     """Yield the database to map from, and the pairs it lacks.
 
     Where contradicted pairs are to be dropped it is a copy without them, gone after the block:
     the project's database keeps every match.
+
+    Args:
+        moves: of its pairs (`moves_of`); None: nothing is dropped.
     """
-    dropped = contradicted_pairs(project) if drop else []
+    dropped = [] if moves is None else contradicted_pairs(project, moves)
     if not dropped:
         yield project.database, []
         return
@@ -34,8 +44,11 @@ def mapping_database(project: Project, drop: bool) -> Iterator[tuple[Path, list[
         yield copy, dropped
 
 
-def contradicted_pairs(project: Project) -> list[Pair]:
+def contradicted_pairs(project: Project, moves: Moves | None = None) -> list[Pair]:
     """Return the verified pairs that the pairs around them or GPS contradict.
+
+    Args:
+        moves: of the project's pairs, where they were read before.
 
     Raises:
         InputError: the database cannot be read.
@@ -43,7 +56,7 @@ def contradicted_pairs(project: Project) -> list[Pair]:
     with open_flight(project) as flight:
         metres = flight.positions.metres
         positions = dict(zip(flight.names, metres, strict=True))
-        found = find_lookalikes(flight.database, positions)
+        found = find_lookalikes(flight.database, positions, moves)
     return [one.pair for one in found if one.contradicted]
 
 

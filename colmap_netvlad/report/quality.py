@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from colmap_netvlad.colmap.database import InitialCamera, open_database
-from colmap_netvlad.graph.lookalikes import Lookalike, find_lookalikes
+from colmap_netvlad.graph.lookalikes import Lookalike, Moves, find_lookalikes
 from colmap_netvlad.graph.viewgraph import (
     MIN_INLIERS,
     GraphStatistics,
@@ -108,6 +108,7 @@ class Source:
         elsewhere: images by the other models of the same run that have them.
         run: how the model was made.
         ground: surveyed points, where the model was placed or measured by some.
+        moves: of the database's pairs, where they were read before the model was made.
     """
 
     name: str
@@ -119,6 +120,7 @@ class Source:
     elsewhere: Mapping[str, str] = field(default_factory=dict)
     run: Run | None = None
     ground: Sequence[GroundPoint] = ()
+    moves: Moves | None = None
 
 
 @dataclass(frozen=True)
@@ -221,9 +223,8 @@ def measure(source: Source) -> Quality:
             graph = weigh_database(database)
             points_of = _points_of_keypoints(model)
             missing = missing_photos(database, set(data.names), points_of, source.elsewhere)
-            lookalikes = with_model(
-                find_lookalikes(database, source.positions), database, data, frame, points_of
-            )
+            found = find_lookalikes(database, source.positions, source.moves)
+            lookalikes = with_model(found, database, data, frame, points_of)
     if not len(data.points):
         not_shown.append("The model has no points: ground, overlap and errors are not known.")
     elif overlap is not None and not _looks_down(data, frame):
