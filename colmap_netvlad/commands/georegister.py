@@ -211,7 +211,9 @@ def keep_place(
 ) -> Placed:
     """Bring a model that was made by enlarging another to where that one is, in place.
 
-    What both have stays where it was: the frame is the old one, and its origin too.
+    The frame is the old one, and its origin too. Without positions in the adjustment, the points
+    that both have stay where they were: more photos may change the focal length, and with it the
+    photos' height over them.
 
     Args:
         before: folder of the model that was enlarged; it is in the world.
@@ -237,7 +239,8 @@ def keep_place(
     model.transform(moved)
     names, centres, _ = _poses(model)
     places = find_places(names, database, images, place.frame)
-    notes = ["Photos were added; those the model had stayed where they were."]
+    stayed = "by their positions, in the same frame" if adjusted else "and the old ground stayed"
+    notes = [f"Photos were added, {stayed}."]
     if place.control:
         notes.append(
             "Ground points placed it before; `colmap-netvlad georegister` with `gcp` measures them "
