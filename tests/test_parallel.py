@@ -19,7 +19,7 @@ from colmap_netvlad.colmap.copies import copy_images
 from colmap_netvlad.colmap.database import images_of_pair
 from colmap_netvlad.demo.simulate import SimulationOptions, simulate_flight
 from colmap_netvlad.graph.viewgraph import read_view_graph
-from colmap_netvlad.mapping import MAPPERS, parallel
+from colmap_netvlad.mapping import MAPPERS, parallel, refine
 from colmap_netvlad.mapping.incremental import map_incremental
 from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.mapping.partition import Cluster, partition
@@ -216,6 +216,24 @@ def test_a_failing_cluster_is_reported_and_its_images_registered_by_the_others(
     parallel.merge_clusters(mapped.database, None, tmp_path, tmp_path / "merged", OPTIONS, report)
     assert pycolmap.Reconstruction(tmp_path / "merged/0").num_reg_images() == 32
     assert report.joined_later == 2
+
+
+def test_images_that_nothing_sees_cost_no_further_adjustment(
+    mapped: Mapped, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    database = tmp_path / "database.db"
+    shutil.copy(mapped.database, database)
+    drop_pairs(database, lambda a, b: b > 16)
+    map_incremental(database, None, tmp_path / "sparse", OPTIONS)
+    adjusted = []
+    adjust = refine._refine_globally
+    monkeypatch.setattr(refine, "_refine_globally", lambda *a: (adjusted.append(a), adjust(*a)))
+    (tmp_path / "merged").mkdir()
+    parallel.merge_models(
+        lambda count: None, database, None, [tmp_path / "sparse/0"], tmp_path / "merged", OPTIONS
+    )
+    assert pycolmap.Reconstruction(tmp_path / "merged/0").num_reg_images() == 16
+    assert len(adjusted) == 1
 
 
 def test_all_clusters_failing_is_an_error(

@@ -94,6 +94,17 @@ def refine(
         for image_id in reconstruction.reg_image_ids():
             mapper.triangulate_image(options.get_triangulation(), image_id)
     reached(0.3)
+    _refine_globally(mapper, options)
+    reached(0.9)
+    _register_missed(mapper, cache, options)
+    mapper.end_reconstruction(False)
+    reconstruction.update_point_3d_errors()
+    reached(1.0)
+
+
+def _refine_globally(
+    mapper: pycolmap.IncrementalMapper, options: pycolmap.IncrementalPipelineOptions
+) -> None:
     mapper.iterative_global_refinement(
         MAX_REFINEMENTS,
         options.ba_global_max_refinement_change,
@@ -103,16 +114,55 @@ def refine(
         normalize_reconstruction=not options.use_prior_position,
     )
     mapper.filter_frames(options.get_mapper())
-    reached(0.9)
-    if reconstruction.num_reg_images() < cache.num_images():
-        # COLMAP's own loop: register, triangulate, adjust locally, adjust globally in the end.
-        # It begins the reconstruction anew; ending it before would remove the missed images.
-        pipeline = pycolmap.IncrementalPipeline(options, cache, pycolmap.ReconstructionManager())
-        mapper = pycolmap.IncrementalMapper(cache)
-        pipeline.reconstruct_sub_model(mapper, options.get_mapper(), reconstruction)
-    mapper.end_reconstruction(False)
-    reconstruction.update_point_3d_errors()
-    reached(1.0)
+
+
+def _register_missed(
+    mapper: pycolmap.IncrementalMapper,
+    cache: pycolmap.DatabaseCache,
+    options: pycolmap.IncrementalPipelineOptions,
+) -> None:
+    """Register the images that the model misses, in the order of COLMAP's incremental pipeline.
+
+    The pipeline itself adjusts everything once more even where nothing can be registered, and
+    above 1,000 images with the iterative solver.
+    """
+    model = mapper.reconstruction
+    pipeline = pycolmap.IncrementalPipeline(options, cache, pycolmap.ReconstructionManager())
+    adjusted = model.num_reg_images(), model.num_points3D()
+    while True:
+        found = _register_next(mapper, options)
+        if not found and model.num_reg_images() <= adjusted[0]:
+            return
+        if not found or pipeline.check_run_global_refinement(model, *adjusted):
+            _refine_globally(mapper, options)
+            adjusted = model.num_reg_images(), model.num_points3D()
+
+
+def _register_next(
+    mapper: pycolmap.IncrementalMapper, options: pycolmap.IncrementalPipelineOptions
+) -> bool:
+    """Register one image, its points and its surroundings; whether there was one."""
+    settings, triangulation = options.get_mapper(), options.get_triangulation()
+    for structure_less, register in (
+        (False, mapper.register_next_image),
+        (True, mapper.register_next_structure_less_image),
+    ):
+        for image_id in mapper.find_next_images(settings, structure_less):
+            if register(settings, image_id):
+                frame = mapper.reconstruction.image(image_id).frame
+                assert frame is not None
+                for seen in frame.image_ids:
+                    mapper.triangulate_image(triangulation, seen.id)
+                mapper.iterative_local_refinement(
+                    options.ba_local_max_refinements,
+                    options.ba_local_max_refinement_change,
+                    settings,
+                    options.get_local_bundle_adjustment(),
+                    triangulation,
+                    image_id,
+                )
+                return True
+    return False
 
 
 def adjust_robustly(
