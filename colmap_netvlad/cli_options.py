@@ -212,8 +212,8 @@ RETRIEVAL: tuple[Callable[[Any], Any], ...] = (
     click.option(
         "--gps",
         type=click.Choice(GPS_MODES),
-        help="Whether positions (priors or EXIF) re-weight the candidates.  [default: auto for"
-        " hybrid, off for the methods of the literature]",
+        help="Whether positions (priors or EXIF) re-weight the candidates.  [default: auto where"
+        " these are compared place by place, else off]",
     ),
     click.option(
         "--rerank",

@@ -83,9 +83,22 @@ def test_a_checkpoint_by_path_is_a_method(project_copy: MakeProject, checkpoint:
     assert ranking.method == "tiny"
     assert ranking.notes == (
         "12 of 12 descriptors computed",
+        "positions of 12 of 12 photos used",
         "up to 11 candidates of each image compared place by place",
     )
     assert ranking.seconds_describe > 0
+
+
+def test_positions_join_in_by_themselves_only_where_candidates_are_compared(
+    project_copy: MakeProject, checkpoint: Path
+) -> None:
+    project = project_copy()
+    compared, alone, vlad = (
+        rank(project, method, RetrievalOptions(k=4, rerank=rerank))
+        for method, rerank in ((str(checkpoint), 100), (str(checkpoint), 0), ("vlad", 100))
+    )
+    assert "positions of 12 of 12 photos used" in compared.notes
+    assert not any("positions" in note for note in (*alone.notes, *vlad.notes))
 
 
 def test_a_second_run_computes_nothing_and_ranks_the_same(

@@ -55,8 +55,8 @@ class RetrievalOptions:
         vocab_tree: the vocabulary tree of `bow`; None: see `bow.find_tree`.
         exact: True or False forces exact search or HNSW; None: see `search.EXACT_UP_TO`.
         masks: folder of masks in COLMAP's way: masked areas are neutral to deep descriptors.
-        gps: whether positions re-weight the candidates, one of `GPS_MODES`; None: "auto" for
-            methods that are not from the literature, else "off".
+        gps: whether positions re-weight the candidates, one of `GPS_MODES`; None: "auto" where
+            candidates are compared place by place, which decides, else "off".
         rerank: most candidates of each image that deep methods compare place by place
             (`retrieval.rerank`); 0: none, the global descriptors alone.
     """

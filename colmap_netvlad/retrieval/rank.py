@@ -118,7 +118,8 @@ def _positions(flight: Flight, method: Method, options: RetrievalOptions) -> Pos
     Raises:
         InputError: no such mode, or positions are required and there are no useful ones.
     """
-    mode = options.gps or ("auto" if method.gps else "off")
+    compared = method.model is not None and options.rerank > 0
+    mode = options.gps or ("auto" if compared else "off")
     if mode not in GPS_MODES:
         raise InputError(f"`gps` is {mode}; choose {', '.join(GPS_MODES)}.")
     if mode == "off" or "positions" in method.needs:

@@ -29,7 +29,6 @@ class Method:
         candidates: ranks a flight's images by appearance (or, for `spatial`, by position), as many
             partners of each as it is told. Where there is a `model` these are compared place by
             place then.
-        gps: whether positions join in by themselves.
         model: the deep model it runs: a name of the catalogue or a checkpoint file.
         takes_model: whether `RetrievalOptions.model` replaces its model; for the others a model
             given there is a method of its own.
@@ -39,7 +38,6 @@ class Method:
     summary: str
     needs: frozenset[str]
     candidates: Callable[[Flight, RetrievalOptions, int], Ranking]
-    gps: bool = False
     model: str | Path | None = None
     takes_model: bool = False
 
@@ -82,7 +80,6 @@ METHODS: dict[str, Method] = {
             " place by place: ours.",
             frozenset({"photos", "features"}),
             hybrid.candidates,
-            gps=True,
             model=DEFAULT,
             takes_model=True,
         ),
