@@ -55,8 +55,8 @@ K = 20
 """Small photos, few features: thousands of photos are to fit into an afternoon on two cores."""
 
 RETRIEVAL = RetrievalOptions(k=K, gps="off")
-"""Rendered positions are exact to a centimetre and would choose nearly all candidates by themselves;
-what is measured is what photos show."""
+"""Rendered positions are exact to a centimetre and would choose nearly all candidates by
+themselves; what is measured is what photos show."""
 
 
 def render(project: Project, photos: int) -> dict[str, Any]:
