@@ -39,6 +39,7 @@ from colmap_netvlad.demo.render import FlightOptions, render_flight
 from colmap_netvlad.flight import open_flight
 from colmap_netvlad.graph.verified import correct_pairs, verified_by_name
 from colmap_netvlad.mapping.incremental import map_incremental
+from colmap_netvlad.mapping.output import numbered
 from colmap_netvlad.mapping.summary import combine
 from colmap_netvlad.matching.options import MatchOptions
 from colmap_netvlad.project import Project
@@ -76,7 +77,7 @@ def run_side(side: str, project: Project, tree: Path) -> dict[str, Any]:
     arguments = [sys.executable, __file__, f"{project.database}:{project.images}"]
     took = watch([*arguments, "--side", side, "--tree", str(tree)])
     stages = json.loads((project.folder / "seconds.json").read_text())
-    models = [pycolmap.Reconstruction(path) for path in sorted(project.sparse.glob("[0-9]*"))]
+    models = [pycolmap.Reconstruction(path) for path in numbered(project.sparse)]
     pairs = verified_by_name(project.database)
     return {
         "wall": took.wall,

@@ -196,6 +196,18 @@ def test_of_several_models_the_largest_is_extended(
     assert newest_model(project) == project.sparse / "1"
 
 
+def test_the_newest_model_is_the_first_of_the_highest_number(
+    project_copy: Callable[..., Project],
+) -> None:
+    project = project_copy()
+    for name in ("sparse", "sparse-2", "sparse-10", "sparse-export-11", "sparse-backup"):
+        for number in (*range(3), 10):
+            folder = project.folder / name / str(number)
+            folder.mkdir(parents=True)
+            pycolmap.Reconstruction().write(folder)
+    assert newest_model(project) == project.folder / "sparse-10" / "0"
+
+
 def test_without_a_model_it_is_one_sentence(project_copy: Callable[..., Project]) -> None:
     with pytest.raises(InputError, match="no model in"):
         newest_model(project_copy())

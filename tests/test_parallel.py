@@ -19,7 +19,7 @@ from colmap_netvlad.colmap.copies import copy_images
 from colmap_netvlad.colmap.database import images_of_pair
 from colmap_netvlad.demo.simulate import SimulationOptions, simulate_flight
 from colmap_netvlad.graph.viewgraph import read_view_graph
-from colmap_netvlad.mapping import MAPPERS, parallel, refine
+from colmap_netvlad.mapping import MAPPERS, parallel, pipelines, refine
 from colmap_netvlad.mapping.incremental import map_incremental
 from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.mapping.partition import Cluster, partition
@@ -348,3 +348,19 @@ def test_other_mappers_write_the_same_layout(mapper: str, mapped: Mapped, tmp_pa
     assert pycolmap.Reconstruction(tmp_path / "sparse/0").num_reg_images() == 32
     with pytest.raises(InputError, match="exists already"):
         MAPPERS[mapper](mapped.database, None, tmp_path / "sparse", options)
+
+
+def write_eleven_models(advance: Callable[[int], None], request: object, folder: Path) -> None:
+    for number in range(11):
+        model = pycolmap.Reconstruction()
+        model.add_camera_with_trivial_rig(
+            pycolmap.Camera.create_from_model_name(number + 1, "SIMPLE_PINHOLE", 9.0, 9, 9)
+        )
+        (folder / str(number)).mkdir()
+        model.write(folder / str(number))
+
+
+def test_eleven_models_come_in_the_order_of_their_numbers(mapped: Mapped, tmp_path: Path) -> None:
+    output = tmp_path / "sparse"
+    models = pipelines._map("somehow", write_eleven_models, mapped.database, None, output)
+    assert [list(model.cameras) for model in models] == [[number + 1] for number in range(11)]

@@ -30,7 +30,7 @@ from colmap_netvlad.graph.pair import Pair
 from colmap_netvlad.mapping.contradicted import dropped_lines, mapping_database, moves_of
 from colmap_netvlad.mapping.extend import extend_model, largest_model, read_model
 from colmap_netvlad.mapping.options import MappingOptions
-from colmap_netvlad.mapping.output import free_output
+from colmap_netvlad.mapping.output import free_output, numbered
 from colmap_netvlad.mapping.priors import PositionPriors
 from colmap_netvlad.mapping.summary import ModelSummary, registered_names, summarize
 from colmap_netvlad.matching.options import MatchOptions, MatchReport, given_up_words
@@ -257,20 +257,14 @@ def newest_model(project: Project) -> Path:
     Raises:
         InputError: there is none.
     """
-    folders = [project.sparse, *project.folder.glob(f"{project.sparse.name}-*")]
-    for folder in sorted(folders, key=lambda folder: _number(folder.name), reverse=True):
-        models = sorted(path for path in folder.glob("*") if path.name.isdigit())
-        if models:
+    again = numbered(project.folder, f"{project.sparse.name}-")
+    for folder in (*reversed(again), project.sparse):
+        if models := numbered(folder):
             return largest_model(models)
     raise InputError(
         f"There is no model in {project.sparse}; run `colmap-netvlad reconstruct`, or name one "
         "with `sparse`."
     )
-
-
-def _number(name: str) -> int:
-    suffix = name.rpartition("-")[2]
-    return int(suffix) if suffix.isdigit() else 1
 
 
 def _extends(model: Path) -> str | None:

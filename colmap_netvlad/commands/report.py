@@ -19,7 +19,7 @@ from colmap_netvlad.colmap.positions import find_priors
 from colmap_netvlad.geo.georeference import FILE as GEOREFERENCE
 from colmap_netvlad.graph.lookalikes import Moves
 from colmap_netvlad.mapping.extend import largest_model, read_model
-from colmap_netvlad.mapping.output import outputs
+from colmap_netvlad.mapping.output import numbered, outputs
 from colmap_netvlad.photos.positions import place
 from colmap_netvlad.project import DATABASE_NAMES
 from colmap_netvlad.report.flight_page import render_flight_page
@@ -233,7 +233,9 @@ def all_reported(output: Path) -> bool:
 
 
 def _models_in(output: Path) -> list[Path]:
-    return [folder for folder in sorted(output.iterdir()) if _holds_model(folder)]
+    own = numbered(output)
+    others = sorted(set(output.iterdir()).difference(own))
+    return [folder for folder in (*own, *others) if _holds_model(folder)]
 
 
 def read_run(folder: Path) -> Run | None:
@@ -263,8 +265,8 @@ def _elsewhere(model: pycolmap.Reconstruction, folder: Path) -> dict[str, str]:
         return {}
     own = {model.image(i).name for i in model.reg_image_ids()}
     found: dict[str, str] = {}
-    for other in sorted(folder.absolute().parent.iterdir()):
-        if other.name.isdigit() and other.name != folder.name and _holds_model(other):
+    for other in numbered(folder.absolute().parent):
+        if other.name != folder.name and _holds_model(other):
             beside = read_model(other)
             names = {beside.image(i).name for i in beside.reg_image_ids()}
             found.update(dict.fromkeys(names - own, f"model {other.name}"))

@@ -47,10 +47,11 @@ def model_folder(output: Path) -> Iterator[Path]:
         shutil.rmtree(temporary, ignore_errors=True)
 
 
-def numbered(folder: Path) -> list[Path]:
-    """Return the folders `folder`/0, 1, ..., in the order of their numbers."""
-    found = (path for path in folder.iterdir() if path.name.isdigit())
-    return sorted(found, key=lambda path: int(path.name))
+def numbered(folder: Path, before: str = "") -> list[Path]:
+    """Return what lies in `folder` as `<before>`0, 1, ..., in the order of the numbers."""
+    number = {path: path.name.removeprefix(before) for path in folder.glob(f"{before}[0-9]*")}
+    found = [path for path, digits in number.items() if digits.isdecimal()]
+    return sorted(found, key=lambda path: int(number[path]))
 
 
 def outputs(output: Path) -> list[Path]:
