@@ -98,7 +98,7 @@ def glances(project: Project) -> set[IndexPair]:
 def table(project: Project, methods: list[str], ks: list[int], options: RetrievalOptions) -> None:
     names, truth = image_names(project.database), truth_of(project)
     total = correct(set(truth), truth)
-    print(f"\n{project.database.stem}: {len(names)} images, {total:,} true pairs")
+    print(f"\n{project.database.parent.name}: {len(names)} images, {total:,} true pairs")
     print(
         "| method | k | pairs | accuracy | recall | 3 rounds: accuracy | recall | same recall at |"
     )

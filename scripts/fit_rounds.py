@@ -4,8 +4,8 @@
 
 Rounds are replayed on each flight with several budgets; every untested candidate after a round
 is an example, labelled by whether the pair verifies. Each flight weighs the same. Prints the
-`FITTED` of `colmap_netvlad/rounds.py`. Databases are only read; descriptors are kept in a cache
-beside them.
+`FITTED` of `colmap_netvlad/pairs/rounds.py`. Databases are only read; descriptors are kept in a
+cache beside them.
 """
 
 from __future__ import annotations
@@ -94,7 +94,8 @@ def main() -> None:
     for project in projects:
         data.append(examples(project, arguments.method, options))
         evidence, labels = data[-1]
-        print(f"{project.database.stem}: {len(evidence):,} examples, {labels.mean():.0%} verify")
+        name = project.database.parent.name
+        print(f"{name}: {len(evidence):,} examples, {labels.mean():.0%} verify")
     weights = fit(data)
     print("Weights(")
     for field in fields(Weights):

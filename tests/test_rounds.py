@@ -15,8 +15,11 @@ from scipy import sparse
 from colmap_netvlad.cache.ranking import Ranking
 from colmap_netvlad.graph.verified import CORRECT_MATCHES
 from colmap_netvlad.pairs.rounds import (
+    FITTED,
+    LEAST_PROBABILITY,
     SATURATION,
     find_candidates,
+    least_probability,
     next_round,
     split_budget,
     take_turns,
@@ -177,6 +180,27 @@ def test_a_later_round_stops_where_nothing_is_promising() -> None:
     all_tested = dict.fromkeys(combinations(range(4), 2), 80)
     assert next_round(similarity, all_tested, ranking.names, 10) == []
     assert next_round(similarity, {(0, 1): 80}, ranking.names, 10) != []
+
+
+def test_a_round_that_did_better_than_was_probable_lets_the_next_go_on() -> None:
+    # A strip of 40 images whose ranking says nothing: partners of partners are all that is known.
+    names = tuple(f"{i:02d}" for i in range(40))
+    lists = [[(j, 1.0) for j in range(i - 6, i + 7) if j != i and 0 <= j < 40] for i in range(40)]
+    similarity = similarity_matrix(from_lists(names, lists, "flat"))
+    before = {(i, i + 1): 40 for i in range(0, 39, 2)}
+    latest = [(i, i + 1) for i in range(1, 39, 2)]
+    weights = FITTED[True]
+
+    def least(count: int) -> float:
+        return least_probability(similarity, before | dict.fromkeys(latest, count), weights, latest)
+
+    assert least(0) == LEAST_PROBABILITY == least_probability(similarity, before, weights, ())
+    assert 0.0 < least(40) < LEAST_PROBABILITY / 2
+    tested = before | dict.fromkeys(latest, 40)
+    careful, bold = (
+        next_round(similarity, tested, names, 999, weights, pairs) for pairs in ([], latest)
+    )
+    assert set(careful) < set(bold)
 
 
 def test_an_image_with_two_candidates_is_not_starved_by_a_crowd() -> None:

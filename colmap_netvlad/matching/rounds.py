@@ -197,7 +197,8 @@ class _Run:
         if number == len(self.plan.rounds):
             weights = FITTED[self.ranking.compared]
             names, verified = self.ranking.names, self._verified()
-            chosen = next_round(similarity, verified, names, room, weights)
+            latest = self.plan.rounds[-1] if number else ()
+            chosen = next_round(similarity, verified, names, room, weights, latest)
             self.plan.rounds.append(chosen)
             self.plan.save()
         seconds = time.perf_counter() - start

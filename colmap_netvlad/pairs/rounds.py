@@ -11,7 +11,7 @@ images; pairs are index pairs with the lower index first.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence, Set
+from collections.abc import Collection, Iterator, Mapping, Sequence, Set
 from dataclasses import astuple, dataclass
 
 import numpy as np
@@ -26,7 +26,10 @@ SATURATION = 100
 """Verified matches from which on a pair's evidence counts fully."""
 
 LEAST_PROBABILITY = 0.05
-"""A round stops where no untested candidate is more probable than this."""
+"""A round stops where no untested candidate is more probable than this, see `least_probability`."""
+
+DOUBT = 5.0
+"""Pairs by which a round's success is held to be chance."""
 
 BLOCK_ROWS = 2048
 """Rows of a sparse product that are in memory at once."""
@@ -97,15 +100,23 @@ def find_candidates(similarity: sparse.csr_array, verified: Mapping[IndexPair, i
         similarity: from `retrieval.fusion.similarity_matrix`.
         verified: verified matches of every tested pair (0 where it failed).
     """
-    n = similarity.shape[0]
-    tested, correct, weight = _tested_matrices(n, verified)
-    failed = (tested - correct).tocsr()
+    results = _tested_matrices(similarity.shape[0], verified)
+    tested, correct, _ = results
     reachable = (similarity + correct @ correct).tocoo()
     upper = reachable.row < reachable.col
     first, second = reachable.row[upper].astype(np.int64), reachable.col[upper].astype(np.int64)
     untested = _sample(tested, first, second) == 0
-    first, second = first[untested], second[untested]
+    return _with_evidence(similarity, results, first[untested], second[untested])
 
+
+def _with_evidence(
+    similarity: sparse.csr_array,
+    results: tuple[sparse.csr_array, sparse.csr_array, sparse.csr_array],
+    first: NDArray[np.int64],
+    second: NDArray[np.int64],
+) -> Candidates:
+    tested, correct, weight = results
+    failed = (tested - correct).tocsr()
     agreeing = _symmetric_product(weight, correct, first, second)
     failing = _symmetric_product(weight, failed, first, second)
     strength = np.maximum(weight.sum(axis=1), 1.0)
@@ -160,13 +171,17 @@ def next_round(
     names: Sequence[str],
     budget: int,
     weights: Weights = FITTED[False],
+    latest: Collection[IndexPair] = (),
 ) -> list[IndexPair]:
     """Return at most `budget` untested pairs to match next, the most valuable first.
 
     With nothing tested yet this is the ranking itself, round-robin over the images. Later,
-    pairs less probable than `LEAST_PROBABILITY` are not worth matching: the list is shorter than
-    the budget, or empty, where nothing promising is left or fewer than that share of what was
-    tested verified.
+    pairs less probable than `least_probability` are not worth matching: the list is shorter than
+    the budget, or empty, where nothing promising is left or fewer than `LEAST_PROBABILITY` of what
+    was tested verified.
+
+    Args:
+        latest: the pairs of the round before, which are among the tested.
     """
     correct = sum(count > CORRECT_MATCHES for count in verified.values())
     if correct < LEAST_PROBABILITY * len(verified):
@@ -177,7 +192,7 @@ def next_round(
         promising = np.ones(len(value), dtype=bool)
     else:
         value = candidates.probability(weights)
-        promising = value > LEAST_PROBABILITY
+        promising = value > least_probability(similarity, verified, weights, latest)
     return take_turns(
         candidates.first[promising],
         candidates.second[promising],
@@ -185,6 +200,37 @@ def next_round(
         names,
         budget,
     )
+
+
+def least_probability(
+    similarity: sparse.csr_array,
+    verified: Mapping[IndexPair, int],
+    weights: Weights,
+    latest: Collection[IndexPair],
+) -> float:
+    """Return how probable a pair must be to be worth matching: `LEAST_PROBABILITY`, or less where
+    more of the latest round verified than was probable.
+
+    There the weights, which are the same for all flights, say too little of this one, and of the
+    pairs that are left as well: the odds that they must have are divided by as many times as
+    those of the latest round were better. Worse ones change nothing, since stopping early costs
+    pairs that nobody finds again.
+    """
+    asked = set(latest)
+    before = {pair: count for pair, count in verified.items() if pair not in asked}
+    if not before or not asked:
+        return LEAST_PROBABILITY
+    first, second = np.array(sorted(asked), dtype=np.int64).T
+    results = _tested_matrices(similarity.shape[0], before)
+    probable = _with_evidence(similarity, results, first, second).probability(weights).sum()
+    correct = sum(verified.get(pair, 0) > CORRECT_MATCHES for pair in asked)
+    odds, expected = (
+        (count + DOUBT) / (len(asked) - count + DOUBT) for count in (correct, probable)
+    )
+    if odds <= expected:
+        return LEAST_PROBABILITY
+    least = LEAST_PROBABILITY / (1 - LEAST_PROBABILITY) * expected / odds
+    return float(least / (1 + least))
 
 
 def replay(
@@ -206,11 +252,12 @@ def replay(
         After each round the verified matches of all pairs tested so far.
     """
     tested: dict[IndexPair, int] = {}
+    chosen: list[IndexPair] = []
     allowed = 0
     for size in split_budget(budget, rounds):
         allowed += size
         room = allowed - len(tested.keys() - unpaid)
-        chosen = next_round(similarity, tested, names, room, weights)
+        chosen = next_round(similarity, tested, names, room, weights, chosen)
         tested.update((pair, truth.get(pair, 0)) for pair in chosen)
         yield dict(tested)
 
