@@ -1,6 +1,7 @@
 """Ray on one machine beside its own processes, and how many machines a driver can serve.
 
     python benchmarks/cluster.py stages PHOTOS [--most 40] [--k 10] [--cluster-size 15]
+    python benchmarks/cluster.py growth DATABASE:PHOTOS [--photos 50 400] [--pairs 600 3000]
     python benchmarks/cluster.py driver DATABASE:PHOTOS [--images 100] [--pairs 200] [--pairs 1000]
 
 `stages` runs each stage on this machine's processes and then as tasks of a Ray cluster that is
@@ -8,6 +9,10 @@ this machine: wall, and CPU seconds of all processes together (looked at five ti
 only). What Ray's own daemons take is in it, starting the cluster is not. Each stage is a command of
 its own: connecting and starting processes is in it on both sides, where the stage starts any.
 Extracting and describing do not on this machine; Ray does them once more with its processes there.
+
+`growth` runs describing and matching as commands of their own for few and for many items, this
+machine's processes and Ray in turn: what a command costs by itself, and what each item costs. CPU
+seconds of the command and, for Ray, of the cluster. A database's matches are left as they are.
 
 `driver` takes the driver's part of a task alone, for shares as large as 30 seconds of work are:
 making the part of the database, handing it to Ray, taking a result from Ray, writing it. CPU
@@ -20,13 +25,22 @@ import importlib.util
 import os
 import pickle
 import shutil
+import socket
 import sqlite3
+import subprocess
 import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable
-from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
+from collections.abc import Callable, Iterator
+from contextlib import (
+    AbstractContextManager,
+    ExitStack,
+    closing,
+    contextmanager,
+    nullcontext,
+    suppress,
+)
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -70,6 +84,8 @@ REPEATS = 3
 
 LOCAL, RAY, WARM = "local", "Ray", "Ray, processes there"
 
+PARTNERS = 8
+
 LOOK_SECONDS = 0.2
 TICK = os.sysconf("SC_CLK_TCK")
 
@@ -83,9 +99,14 @@ class Cost:
 
 
 class Family:
-    """The CPU seconds of this process and of all that it started, those gone included."""
+    """The CPU seconds of processes and of all that they started, those gone included.
 
-    def __init__(self) -> None:
+    Args:
+        heads: their numbers; default: this process.
+    """
+
+    def __init__(self, *heads: int) -> None:
+        self._heads = heads or (os.getpid(),)
         self._seen: dict[int, float] = {}
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._watch, daemon=True)
@@ -110,7 +131,7 @@ class Family:
             number = int(stat.parent.name)
             parents[number] = int(fields[1])
             used[number] = (int(fields[11]) + int(fields[12])) / TICK
-        family, size = {os.getpid()}, 0
+        family, size = set(self._heads), 0
         while len(family) != size:
             size = len(family)
             family |= {process for process, parent in parents.items() if parent in family}
@@ -238,6 +259,130 @@ def stages(photos: Path, most: int, k: int, max_features: int, cluster_size: int
     Console(width=160).print(table)
 
 
+DESCRIBE = """
+import sys
+from contextlib import nullcontext
+from pathlib import Path
+from colmap_netvlad import on_cluster
+from colmap_netvlad.cache.photos import contents
+from colmap_netvlad.cache.store import Store
+from colmap_netvlad.models.catalogue import DEFAULT
+from colmap_netvlad.retrieval.methods import deep
+from colmap_netvlad.retrieval.options import RetrievalOptions
+
+photos, cache, *names = sys.argv[1].split("|")
+with on_cluster(sys.argv[2]) if len(sys.argv) > 2 else nullcontext(), Store(Path(cache)) as store:
+    known, _ = contents(store, {name: Path(photos, name) for name in names})
+    file = deep.checkpoint_file(DEFAULT)
+    assert not deep._describe(store, "", file, Path(photos), names, known, RetrievalOptions())
+"""
+"""`pairs`, as far as to the descriptors; so that processes do not start with this script."""
+
+
+def describe_command(scene: Project, count: int, folder: Path, address: str) -> list[str]:
+    names = image_names(scene.database)[:count]
+    listed = "|".join([str(scene.images), str(folder / "cache.db"), *names])
+    return [sys.executable, "-c", DESCRIBE, listed, *([address] if address else [])]
+
+
+def match_command(
+    matcher: str, scene: Project, count: int, folder: Path, address: str
+) -> list[str]:
+    database, listed = folder / "project.db", folder / "pairs.txt"
+    without_matches(scene.database, database)
+    names = image_names(database)
+    # The same partners for few photos and for many: what a pair takes depends on its overlap.
+    pairs = [(a, b) for i, a in enumerate(names) for b in names[i + 1 : i + 1 + PARTNERS]][:count]
+    listed.write_text("".join(f"{a} {b}\n" for a, b in pairs))
+    command = ["match", "--db", database, "--pairs", listed, "--matcher", matcher]
+    cluster = ["--cluster", address] if address else []
+    return [sys.executable, "-m", "colmap_netvlad", *map(str, command), *cluster]
+
+
+GROWING: dict[str, Callable[[Project, int, Path, str], list[str]]] = {
+    "describe": describe_command,
+    "guided": partial(match_command, "guided"),
+    "colmap": partial(match_command, "colmap"),
+}
+
+
+def run_command(command: list[str], *heads: int) -> Cost:
+    """Run a command; its CPU seconds and, meanwhile, those of the processes `heads`."""
+    others = Family(*heads) if heads else None
+    before = others.seconds() if others else 0.0
+    start = time.monotonic()
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
+        own = Family(process.pid)
+        if process.wait():
+            raise click.ClickException(f"{' '.join(command)[:200]} failed.")
+    wall = time.monotonic() - start
+    return Cost(wall, own.seconds() + (others.seconds() - before if others else 0.0))
+
+
+@contextmanager
+def cluster_of_processes() -> Iterator[tuple[str, int]]:
+    """Yield the address of a cluster that is this machine, and the process that holds it."""
+    host, port = "127.0.0.1", 6399
+    options = ["--head", "--block", f"--node-ip-address={host}", f"--port={port}"]
+    options += [f"--num-cpus={usable_processors()}", "--include-dashboard=false"]
+    ray_start = [str(Path(sys.executable).with_name("ray")), "start", *options]
+    with subprocess.Popen(ray_start, stdout=subprocess.DEVNULL) as head:
+        try:
+            for _ in range(60):
+                with suppress(OSError), socket.create_connection((host, port), 1.0):
+                    break
+                time.sleep(1.0)
+            time.sleep(5.0)  # its workers
+            yield f"{host}:{port}", head.pid
+        finally:
+            head.terminate()
+
+
+@cli.command()
+@click.argument("scene", metavar="DATABASE:PHOTOS")
+@click.option("--photos", nargs=2, default=(50, 400), show_default=True)
+@click.option("--pairs", nargs=2, default=(600, 3000), show_default=True)
+@click.option("--stages", default="describe,guided,colmap", show_default=True)
+@click.option("--repeats", default=2, show_default=True)
+def growth(
+    scene: str, photos: tuple[int, int], pairs: tuple[int, int], stages: str, repeats: int
+) -> None:
+    """Print what commands cost by themselves, and what each item costs, both ways."""
+    database, _, folder = scene.partition(":")
+    project = Project(Path(database), Path(folder))
+    table = Table("stage", "items", *(f"{side}: wall s, CPU s" for side in (LOCAL, RAY)), "ratio")
+    with cluster_of_processes() as (address, head):
+        for stage in stages.split(","):
+            sizes = photos if stage == "describe" else pairs
+            cpu = dict[tuple[str, int], float]()
+            for size in sizes:
+                costs: dict[str, list[Cost]] = {LOCAL: [], RAY: []}
+                for _ in range(repeats):
+                    for side in costs:
+                        with tempfile.TemporaryDirectory() as scratch:
+                            where = address if side == RAY else ""
+                            command = GROWING[stage](project, size, Path(scratch), where)
+                            costs[side].append(run_command(command, *([head] if where else [])))
+                        print(f"{stage}, {size:,}, {side}: {costs[side][-1]}", flush=True)
+                cells = []
+                for side, found in costs.items():
+                    cpu[side, size] = sum(cost.cpu for cost in found) / repeats
+                    wall = sum(cost.wall for cost in found) / repeats
+                    cells.append(f"{wall:.1f}, {cpu[side, size]:.1f}")
+                table.add_row(
+                    stage, f"{size:,}", *cells, f"{cpu[RAY, size] / cpu[LOCAL, size]:.2f}"
+                )
+            few, many = sizes
+            each = {side: (cpu[side, many] - cpu[side, few]) / (many - few) for side in costs}
+            alone = {side: cpu[side, few] - few * each[side] for side in costs}
+            table.add_row(
+                "", "alone, each",
+                *(f"{alone[side]:.1f} s, {1000 * each[side]:.1f} ms" for side in costs),
+                f"{each[RAY] / each[LOCAL]:.2f}",
+            )  # fmt: skip
+    Console(width=160).print(table)
+
+
 def shown(cost: Cost, local: Cost) -> str:
     """Return a cost, and the ratio of its CPU seconds to the local ones."""
     ratio = "" if cost is local else f" ({cost.cpu / local.cpu:.2f})"
@@ -254,7 +399,7 @@ def driver(scene: str, images: int, pairs: tuple[int, ...]) -> None:
     table = Table(
         "stage", "items of a share", "MiB there", "MiB back", "driver ms an item", "items/s"
     )
-    ray.init(num_cpus=1, include_dashboard=False, log_to_driver=False)
+    ray.init("local", num_cpus=1, include_dashboard=False, log_to_driver=False)
     with tempfile.TemporaryDirectory() as scratch:
         source = without_matches(Path(database), Path(scratch, "project.db"))
         names = image_names(source)[:images]
