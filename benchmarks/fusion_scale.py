@@ -37,7 +37,7 @@ from colmap_netvlad.flight import Flight
 from colmap_netvlad.matching import rounds
 from colmap_netvlad.matching.options import MatchReport
 from colmap_netvlad.project import Project
-from colmap_netvlad.retrieval import rerank
+from colmap_netvlad.retrieval import counts
 from colmap_netvlad.retrieval.methods import deep, vlad
 from colmap_netvlad.retrieval.options import RetrievalOptions
 
@@ -104,14 +104,17 @@ def searched(seed: int) -> Callable[..., Ranking]:
     return candidates
 
 
-def compared(pairs: NDArray[np.intp], ids: NDArray[np.int64], store: Store, *_: Any) -> None:
+def compared(
+    pairs: NDArray[np.intp], ids: NDArray[np.int64], store: Store, *_: Any
+) -> list[tuple[int, int, int, float]]:
     """Keep counts of pairs that fall with the distance."""
     ground = grid(len(ids))
     apart = np.linalg.norm(ground[pairs[:, 0]] - ground[pairs[:, 1]], axis=1)
     counts = np.where(apart < OVERLAP, 80 - 20 * apart, 8).astype(int)
     keys = np.sort(ids[pairs], axis=1)
-    rows = zip(*keys.T.tolist(), counts.tolist(), [0.0] * len(keys), strict=True)
+    rows = list(zip(*keys.T.tolist(), counts.tolist(), [0.0] * len(keys), strict=True))
     store.add_agreements(rows)
+    return rows
 
 
 class Verified:
@@ -134,7 +137,7 @@ def measure(command: str, size: int, folder: Path) -> str:
     project = make_project(folder, size)
     deep.candidates, vlad.candidates = searched(1), searched(2)
     deep.cells_key = lambda *_: MODEL
-    rerank._compare = compared
+    counts._compare = compared
     verified = Verified(size)
     rounds.match_pairs = verified.match
     rounds._Run._verified = lambda _: dict(verified.found)

@@ -38,8 +38,8 @@ from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval.fusion import similarity_matrix
 from colmap_netvlad.retrieval.methods import deep
 from colmap_netvlad.retrieval.options import RetrievalOptions
+from colmap_netvlad.retrieval.places import Places, agreeing_matches, agreement
 from colmap_netvlad.retrieval.rank import rank_project
-from colmap_netvlad.retrieval.rerank import Places, agreeing_matches, agreement
 
 FIGURES = Path(__file__).parents[1] / "docs" / "figures"
 

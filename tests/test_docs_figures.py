@@ -10,7 +10,7 @@ import pytest
 
 from colmap_netvlad.demo.render import RenderedFlight
 from colmap_netvlad.project import Project
-from colmap_netvlad.retrieval.rerank import agreeing_matches
+from colmap_netvlad.retrieval.places import agreeing_matches
 
 SCRIPT = Path(__file__).parents[1] / "scripts" / "make_figures.py"
 

@@ -16,15 +16,15 @@ from colmap_netvlad.cache.cells import Cells
 from colmap_netvlad.cache.ranking import NO_PARTNER, Ranking
 from colmap_netvlad.cache.store import Store
 from colmap_netvlad.cli import cli
+from colmap_netvlad.retrieval import counts
 from colmap_netvlad.retrieval import rerank as module
 from colmap_netvlad.retrieval.options import COMPARED, RetrievalOptions
+from colmap_netvlad.retrieval.places import Places, agreeing_matches
 from colmap_netvlad.retrieval.rerank import (
     ASK,
     CHANCE,
     PATIENCE,
     SURE,
-    Places,
-    agreeing_matches,
     rerank,
 )
 
@@ -169,7 +169,7 @@ def compared_in_a_circle(tmp_path: Path, monkeypatch):
         pairs = set()
 
         def count(one: Places, other: Places) -> int:
-            pair = tuple(sorted(int(places.vectors[0].argmax()) for places in (one, other)))
+            pair = tuple(sorted(int(places.codes[0].argmax()) for places in (one, other)))
             pairs.add(pair)
             return agreeing.get(pair, otherwise)
 
@@ -255,7 +255,7 @@ def test_a_new_and_a_changed_photo_cost_their_own_pairs_only(store: Store, monke
 
 
 def test_a_run_that_was_stopped_goes_on_where_it_was(store: Store, monkeypatch) -> None:
-    monkeypatch.setattr(module, "KEEP_PAIRS", 1)
+    monkeypatch.setattr(counts, "KEEP_PAIRS", 1)
     asked = []
 
     def stopped(one: Places, other: Places) -> int:

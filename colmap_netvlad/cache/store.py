@@ -172,13 +172,16 @@ class Store:
         )
         with self._transaction():
             if cells and self._has_cells(model, names):
-                self._db["settings"].insert({"key": ORPHANS_SETTING, "value": "1"}, replace=True)
+                self._leave_orphans()
             self._db["descriptors"].insert_all(rows, replace=True)
             self._db["cells"].insert_all(codes, replace=True)
 
     def _has_cells(self, model: str, names: Sequence[str]) -> bool:
         query = "SELECT 1 FROM cells WHERE model = ? AND image = ?"
         return any(self._db.execute(query, [model, name]).fetchone() for name in names)
+
+    def _leave_orphans(self) -> None:
+        self._db["settings"].insert({"key": ORPHANS_SETTING, "value": "1"}, replace=True)
 
     def seconds(self, model: str, names: Iterable[str]) -> float:
         """Return what describing these images, which are described, took when it was done, s."""
@@ -230,6 +233,26 @@ class Store:
         with self._faults():
             rows = self._db.execute("SELECT image, number FROM cells WHERE model = ?", [model])
             return dict(rows.fetchall())
+
+    def number(self, kind: str, photos: Mapping[str, str]) -> None:
+        """Give images a number under a kind of features that are not kept here but read where they
+        lie; where they changed, another one.
+
+        Args:
+            kind: as `model` of cells.
+            photos: name -> fingerprint of the features.
+        """
+        known = self.described_in_cells(kind)
+        rows = [
+            {"model": kind, "image": name, "photo": photo, "height": 0, "width": 0, "codes": b""}
+            for name, photo in photos.items()
+            if known.get(name) != photo
+        ]
+        if rows:
+            with self._transaction():
+                if any(row["image"] in known for row in rows):
+                    self._leave_orphans()
+                self._db["cells"].insert_all(rows, replace=True)
 
     def read_cells(self, number: int) -> Cells:
         """Return the cells of that number.

@@ -9,16 +9,14 @@ from __future__ import annotations
 import logging
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Generator, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pycolmap
-import torch
-from threadpoolctl import threadpool_limits
 
 from colmap_netvlad.colmap import engine
 from colmap_netvlad.colmap.copies import LOCK_SECONDS
@@ -32,6 +30,7 @@ from colmap_netvlad.matching.options import MatchOptions, Work
 from colmap_netvlad.matching.verify import verify
 from colmap_netvlad.runtime import workers
 from colmap_netvlad.runtime.jobs import Source
+from colmap_netvlad.runtime.products import one_thread
 from colmap_netvlad.runtime.sequences import blocks
 
 logger = logging.getLogger(__name__)
@@ -165,7 +164,7 @@ def match_block(
 ) -> BlockReport:
     """Match and verify the pairs of a block; after Ctrl-C, no more of them."""
     report, start = BlockReport(), time.monotonic()
-    with _one_thread(), open_database(database, LOCK_SECONDS) as colmap:
+    with one_thread(), open_database(database, LOCK_SECONDS) as colmap:
         for pair in pairs:
             if workers.unwanted():
                 break
@@ -189,14 +188,3 @@ def _verified(
     places = one.features.at, other.features.at
     geometry = verify((one.camera, other.camera), places, matches, seed)
     return PairResult(pair, matches, geometry)
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        with threadpool_limits(1):
-            yield
-    finally:
-        torch.set_num_threads(threads)

@@ -1,11 +1,4 @@
-"""A glance at two photos: do the largest features of both agree on where one lies in the other?
-
-A SIFT feature has a place, a scale and an orientation, so that a single match already says how
-one photo is turned, scaled and shifted in the other. Each match is asked how many others lie
-where it predicts and are turned and scaled alike. Wrong matches predict each something else; of
-right ones, few among many wrong are enough. There is no single model: a facade and the street
-before it may each have their own.
-"""
+"""A glance at two photos: do the largest features of both agree on where one lies in the other?"""
 
 from __future__ import annotations
 
@@ -15,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from colmap_netvlad.graph.oriented import Matches, agreements, predicted
 from colmap_netvlad.matching.features import SiftFeatures
 from colmap_netvlad.matching.nearest import MAX_RATIO, nearest
 
@@ -32,20 +26,8 @@ this, 321 where all count alike (of 549)."""
 MOST_ASKED = 256
 """Matches asked at most, those of the best ratio."""
 
-TURN = 0.5
-SCALING = 0.45
-"""How far matches that agree may differ in turn (rad) and in logarithm of scaling."""
-
-SHIFT = 60.0
-STRETCH = 0.25
-"""How far from its predicted place a match may lie: pixels, and share of its distance from the
-match that predicts (turn and scale of a feature are inexact, and ground is not flat). Half as
-wide keeps more false pairs with the same true ones."""
-
 NEIGHBOURS = 8
 """Matches nearest to one of which one should lie where it predicts."""
-
-Matches = NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,45 +97,11 @@ def distinct(one: SiftFeatures, other: SiftFeatures, matches: Matches) -> NDArra
     return keep
 
 
-def agreements(one: SiftFeatures, other: SiftFeatures, matches: Matches) -> NDArray[np.bool_]:
-    """Return (M, M) whether two matches each lie where the other predicts; of itself, True."""
-    i, j = matches.T
-    turn, scaling = other.angle[j] - one.angle[i], other.log_scale[j] - one.log_scale[i]
-    turns = np.abs(turn[:, None] - turn)
-    turns = np.minimum(turns % (2 * np.pi), 2 * np.pi - turns % (2 * np.pi))
-    alike = (turns < TURN) & (np.abs(scaling[:, None] - scaling) < SCALING)
-    rows, columns = np.nonzero(alike)
-    alike[rows, columns] = _predicted(one, other, matches, rows, columns)
-    return alike & alike.T
-
-
 def neighbours_agree(one: SiftFeatures, other: SiftFeatures, matches: Matches) -> NDArray[np.bool_]:
     """Return (M,) whether one of the nearest matches lies where a match predicts."""
     at = one.at[matches[:, 0]]
     nearest_matches = cKDTree(at).query(at, min(NEIGHBOURS + 1, len(at)))[1][:, 1:]
     rows = np.repeat(np.arange(len(at)), nearest_matches.shape[1])
     columns = nearest_matches.ravel()
-    predicted = _predicted(one, other, matches, rows, columns) & (rows != columns)
-    return predicted.reshape(nearest_matches.shape).any(axis=1)
-
-
-def _predicted(
-    one: SiftFeatures,
-    other: SiftFeatures,
-    matches: Matches,
-    rows: NDArray[np.intp],
-    columns: NDArray[np.intp],
-) -> NDArray[np.bool_]:
-    """Return whether the matches `columns` lie where the matches `rows` predict."""
-    i, j = matches.T
-    turn, scaling = other.angle[j] - one.angle[i], other.log_scale[j] - one.log_scale[i]
-    similarity = np.exp(scaling + 1j * turn).astype(np.complex64)
-    from_place, to_place = _complex(one.at[i]), _complex(other.at[j])
-    moved = to_place[columns] - to_place[rows]
-    off = np.abs(similarity[rows] * (from_place[columns] - from_place[rows]) - moved)
-    near: NDArray[np.bool_] = np.less(off, SHIFT + STRETCH * np.abs(moved))
-    return near
-
-
-def _complex(at: NDArray[np.float32]) -> NDArray[np.complex64]:
-    return at[:, 0] + np.complex64(1j) * at[:, 1]
+    near = predicted(one, other, matches, rows, columns) & (rows != columns)
+    return near.reshape(nearest_matches.shape).any(axis=1)

@@ -12,6 +12,7 @@ from zlib import crc32
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_netvlad.graph.oriented import scale_and_angle
 from colmap_netvlad.matching.nearest import Codes
 
 SIFT_BYTES = 128
@@ -67,7 +68,7 @@ def prepare(keypoints: NDArray[np.float32], descriptors: NDArray[np.uint8]) -> S
         raise ValueError(f"{len(keypoints)} keypoints have {len(descriptors)} descriptors")
     if descriptors.shape[1] != SIFT_BYTES or descriptors.dtype != np.uint8:
         raise ValueError(f"descriptors are not SIFT's {SIFT_BYTES} bytes")
-    scale, angle = _scale_and_angle(keypoints)
+    scale, angle = scale_and_angle(keypoints)
     good = np.isfinite(keypoints).all(axis=1) & (scale > 0)
     at = np.where(good[:, None], keypoints[:, :2], np.nan).astype(np.float32)
     if not good.all():
@@ -85,19 +86,6 @@ def prepare(keypoints: NDArray[np.float32], descriptors: NDArray[np.uint8]) -> S
         corners=_corners(at[good]),
         checksum=crc32(descriptors.tobytes(), crc32(keypoints.tobytes())),
     )
-
-
-def _scale_and_angle(
-    keypoints: NDArray[np.float32],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return (N,) scale and orientation; 1 and 0 where keypoints have none."""
-    shape = keypoints[:, 2:].astype(np.float64)
-    if shape.shape[1] == 2:
-        return shape[:, 0], shape[:, 1]
-    if shape.shape[1] == 4:
-        a11, a12, a21, a22 = shape.T
-        return np.sqrt(np.abs(a11 * a22 - a12 * a21)), np.arctan2(a21, a11)
-    return np.ones(len(shape)), np.zeros(len(shape))
 
 
 def _corners(at: NDArray[np.float32]) -> NDArray[np.float64]:

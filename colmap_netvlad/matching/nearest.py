@@ -1,18 +1,13 @@
-"""Nearest descriptors: best and second best of a few against many, as small exact products.
-
-Products of bytes are whole numbers below 2^24, which float32 holds too: whichever of the two the
-processor multiplies faster, the result is the same bit for bit.
-"""
+"""Nearest descriptors: best and second best of a few against many, as small exact products."""
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
-from functools import cache
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
+
+from colmap_netvlad.runtime.products import operand, products
 
 PRODUCT = 2**20
 ROWS = (128, 512)
@@ -27,9 +22,6 @@ LOWER = 128
 
 NONE = np.iinfo(np.int32).min
 """Below all products."""
-
-TRIED = 2048
-"""Columns of the product that tells whether bytes or floats are faster."""
 
 MAX_ANGLE = 0.7
 MAX_RATIO = 0.8
@@ -88,56 +80,23 @@ def nearest(queries: Codes, codes: Codes) -> Nearest:
     best = np.full(count, -1, np.intp)
     first, second = np.zeros((2, count), np.int32)
     if count and len(codes):
-        kind = bytes_or_floats()
-        rows_of, columns = torch.from_numpy(queries.values), torch.from_numpy(codes.values).to(kind)
-        shift = codes.shift.astype(np.int32 if kind == torch.int8 else np.float32)
+        columns = operand(codes.values)
         step = int(np.clip(PRODUCT // len(codes), *ROWS))
         for start in range(0, count, step):
             part = slice(start, start + step)
-            products = _products(rows_of[part].to(kind), columns.T)
-            np.add(products, shift, out=products)
-            rows = np.arange(len(products))
-            best[part] = products.argmax(axis=1)
-            first[part] = products[rows, best[part]]
-            products[rows, best[part]] = NONE
-            second[part] = products[rows, products.argmax(axis=1)]
+            found = products(operand(queries.values[part]), columns)
+            np.add(found, codes.shift.astype(found.dtype), out=found)
+            rows = np.arange(len(found))
+            best[part] = found.argmax(axis=1)
+            first[part] = found[rows, best[part]]
+            found[rows, best[part]] = NONE
+            second[part] = found[rows, found.argmax(axis=1)]
         rest = queries.shift + LOWER**2 * queries.values.shape[1]
         first += rest
         second = np.where(second == NONE, 0, second + rest)
     angle, other = _angle(first), _angle(second)
     ratio = (angle / np.maximum(other, 1e-6)).astype(np.float32)
     return Nearest(best, angle, ratio)
-
-
-@cache
-def bytes_or_floats() -> torch.dtype:
-    """Return what this machine multiplies faster: `torch.int8` or `torch.float32`.
-
-    Processors with instructions for products of bytes (AVX512-VNNI, AVX-VNNI, AMX) do these
-    faster; others, and some builds of torch, much slower, or have no such product.
-    """
-    if not hasattr(torch, "_int_mm"):
-        return torch.float32
-    return min((torch.int8, torch.float32), key=_seconds)
-
-
-def _seconds(kind: torch.dtype) -> float:
-    """Return the shortest time of a few products; infinite where they cannot be made."""
-    codes = (torch.arange(TRIED * 128) % 251 - 125).reshape(TRIED, 128).to(kind)
-    times = []
-    for _ in range(5):
-        start = time.perf_counter()
-        try:
-            _products(codes[: ROWS[0]], codes.T)
-        except (RuntimeError, NotImplementedError):
-            return float("inf")
-        times.append(time.perf_counter() - start)
-    return min(times)
-
-
-def _products(a: torch.Tensor, b: torch.Tensor) -> NDArray[np.int32] | NDArray[np.float32]:
-    """Return (M, N) the products of rows and columns, of bytes as int32."""
-    return (torch._int_mm(a, b) if a.dtype == torch.int8 else a @ b).numpy()
 
 
 def _angle(products: NDArray[np.int32]) -> NDArray[np.float32]:

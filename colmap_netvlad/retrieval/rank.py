@@ -10,6 +10,7 @@ from colmap_netvlad.flight import Flight, open_flight
 from colmap_netvlad.photos.positions import Positions
 from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval.bands import for_bands, multispectral_shots, of_shots
+from colmap_netvlad.retrieval.confirm import largest_features
 from colmap_netvlad.retrieval.gps import near_first
 from colmap_netvlad.retrieval.methods import Method, deep, find_method, hdf5
 from colmap_netvlad.retrieval.options import (
@@ -68,7 +69,7 @@ def _rank(flight: Flight, method: Method, options: RetrievalOptions, least_depth
     if method.model and options.rerank:
         model = deep.cells_key(options.model or method.model, options)
         compared = min(options.rerank, others)
-        ranking = rerank(ranking, flight.store, model, k, compared)
+        ranking = rerank(ranking, flight.store, model, k, compared, largest_features(flight))
         note = f"up to {compared} candidates of each image compared place by place"
         ranking = replace(ranking, notes=(*ranking.notes, note))
     if k < options.k:

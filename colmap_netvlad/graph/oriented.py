@@ -1,0 +1,92 @@
+"""Matches of oriented features: each says by itself how one photo lies in the other.
+
+A SIFT feature has a place, a scale and an orientation, so that a single match already says how
+one photo is turned, scaled and shifted in the other. Each match is asked how many others lie
+where it predicts and are turned and scaled alike. Wrong matches predict each something else; of
+right ones, few among many wrong are enough. There is no single model: a facade and the street
+before it may each have their own.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+TURN = 0.5
+SCALING = 0.45
+"""How far matches that agree may differ in turn (rad) and in logarithm of scaling."""
+
+SHIFT = 60.0
+STRETCH = 0.25
+"""How far from its predicted place a match may lie: pixels, and share of its distance from the
+match that predicts (turn and scale of a feature are inexact, and ground is not flat). Half as
+wide keeps more false pairs with the same true ones."""
+
+Matches = NDArray[np.intp]
+"""(M, 2) features of two photos."""
+
+
+class Oriented(Protocol):
+    """Features of one photo.
+
+    Attributes:
+        at: (N, 2) x, y, pixels.
+        log_scale: (N,) natural logarithm of the scale.
+        angle: (N,) orientation, rad.
+    """
+
+    @property
+    def at(self) -> NDArray[np.float32]: ...
+    @property
+    def log_scale(self) -> NDArray[np.float32]: ...
+    @property
+    def angle(self) -> NDArray[np.float32]: ...
+
+
+def agreements(one: Oriented, other: Oriented, matches: Matches) -> NDArray[np.bool_]:
+    """Return (M, M) whether two matches each lie where the other predicts; of itself, True."""
+    i, j = matches.T
+    turn, scaling = other.angle[j] - one.angle[i], other.log_scale[j] - one.log_scale[i]
+    turns = np.abs(turn[:, None] - turn)
+    turns = np.minimum(turns % (2 * np.pi), 2 * np.pi - turns % (2 * np.pi))
+    alike = (turns < TURN) & (np.abs(scaling[:, None] - scaling) < SCALING)
+    rows, columns = np.nonzero(alike)
+    alike[rows, columns] = predicted(one, other, matches, rows, columns)
+    return alike & alike.T
+
+
+def predicted(
+    one: Oriented,
+    other: Oriented,
+    matches: Matches,
+    rows: NDArray[np.intp],
+    columns: NDArray[np.intp],
+) -> NDArray[np.bool_]:
+    """Return whether the matches `columns` lie where the matches `rows` predict."""
+    i, j = matches.T
+    turn, scaling = other.angle[j] - one.angle[i], other.log_scale[j] - one.log_scale[i]
+    similarity = np.exp(scaling + 1j * turn).astype(np.complex64)
+    from_place, to_place = _complex(one.at[i]), _complex(other.at[j])
+    moved = to_place[columns] - to_place[rows]
+    off = np.abs(similarity[rows] * (from_place[columns] - from_place[rows]) - moved)
+    near: NDArray[np.bool_] = np.less(off, SHIFT + STRETCH * np.abs(moved))
+    return near
+
+
+def _complex(at: NDArray[np.float32]) -> NDArray[np.complex64]:
+    return at[:, 0] + np.complex64(1j) * at[:, 1]
+
+
+def scale_and_angle(
+    keypoints: NDArray[np.float32],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return (N,) scale and orientation; 1 and 0 where keypoints have none."""
+    shape = keypoints[:, 2:].astype(np.float64)
+    if shape.shape[1] == 2:
+        return shape[:, 0], shape[:, 1]
+    if shape.shape[1] == 4:
+        a11, a12, a21, a22 = shape.T
+        return np.sqrt(np.abs(a11 * a22 - a12 * a21)), np.arctan2(a21, a11)
+    return np.ones(len(shape)), np.zeros(len(shape))

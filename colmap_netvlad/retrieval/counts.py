@@ -1,0 +1,143 @@
+"""How much agrees in pairs of images: counted once, kept in the store."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from functools import cached_property, lru_cache
+from typing import Generic, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_netvlad.cache.store import Store
+from colmap_netvlad.runtime.machine import usable_processors
+from colmap_netvlad.runtime.products import threads_of_their_own
+from colmap_netvlad.runtime.progress import step
+
+CACHE_BYTES = 256 << 20
+"""Memory for features of one kind, so that an image's are not read anew for each pair."""
+
+KEEP_PAIRS = 2000
+"""Pairs compared between two writes to the store."""
+
+Pairs = NDArray[np.intp]
+"""(M, 2) pairs of indices of images."""
+
+
+class Seen(Protocol):
+    """What of a photo is compared."""
+
+    @property
+    def nbytes(self) -> int:
+        """Memory it takes."""
+        ...
+
+
+Kind = TypeVar("Kind", bound=Seen)
+
+Rows = list[tuple[int, int, int, float]]
+"""Numbers of two images, lower first; how much agrees; seconds."""
+
+
+class Counts(Generic[Kind]):
+    """Counts of what agrees in pairs of N images by one kind of features.
+
+    Attributes:
+        numbers: (N,) what the store knows the images' features by; 0 where there are none.
+    """
+
+    def __init__(
+        self,
+        store: Store,
+        numbers: NDArray[np.int64],
+        read: Callable[[int], Kind],
+        agreeing: Callable[[Kind, Kind], int],
+    ) -> None:
+        """Start from what the store has.
+
+        Args:
+            read: an image's features, by its index.
+            agreeing: how much agrees in two images.
+        """
+        self.numbers = numbers
+        self._store, self._read, self._agreeing = store, read, agreeing
+        pairs, self._matches, self._seconds = store.agreements()
+        self._keys = _joined(pairs)
+
+    def has(self, pairs: Pairs) -> NDArray[np.bool_]:
+        """Return (M,) whether both images have such features."""
+        has: NDArray[np.bool_] = np.all(self.numbers[pairs] > 0, axis=1)
+        return has
+
+    def count(self, pairs: Pairs) -> tuple[NDArray[np.int64], float]:
+        """Return (M,) how much agrees, 0 where there are no features; the seconds that counting
+        took, now or when the pairs were first compared.
+
+        Args:
+            pairs: ordered by their first image.
+        """
+        has = self.has(pairs)
+        pairs = pairs[has]
+        keys = _joined(np.sort(self.numbers[pairs], axis=1))
+        missing = ~np.isin(keys, self._keys)
+        if missing.any():
+            self._add(
+                _compare(pairs[missing], self.numbers, self._store, self._read, self._agreeing)
+            )
+        at = np.searchsorted(self._keys, keys)
+        matches = np.zeros(len(has), np.int64)
+        matches[has] = self._matches[at]
+        return matches, float(self._seconds[at].sum())
+
+    @cached_property
+    def _latest(self) -> Callable[[int], Kind]:
+        """From an image's index to its features, the latest kept in memory."""
+        size = self._read(int(np.flatnonzero(self.numbers)[0])).nbytes
+        return lru_cache(maxsize=max(CACHE_BYTES // max(size, 1), 2))(self._read)
+
+    def _add(self, rows: Rows) -> None:
+        first, second, matches, seconds = np.array(rows).T
+        pairs = np.stack([first, second], axis=1).astype(np.int64)
+        keys = np.concatenate([self._keys, _joined(pairs)])
+        order = np.argsort(keys, kind="stable")
+        self._keys = keys[order]
+        self._matches = np.concatenate([self._matches, matches.astype(np.int64)])[order]
+        self._seconds = np.concatenate([self._seconds, seconds])[order]
+
+
+def _joined(keys: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return (M,) one number for each row of (M, 2) positive numbers below 2^31, in their order."""
+    return (keys[:, 0] << 32) + keys[:, 1]
+
+
+def _compare(
+    pairs: Pairs,
+    numbers: NDArray[np.int64],
+    store: Store,
+    read: Callable[[int], Kind],
+    agreeing: Callable[[Kind, Kind], int],
+) -> Rows:
+    """Count what agrees in pairs, ordered by their first image, into the store; return it."""
+    starts = np.flatnonzero(np.diff(pairs[:, 0], prepend=-1))
+    rows: Rows = []
+    kept = 0
+    with (
+        step("Pairs of candidates", len(pairs)) as bar,
+        # A pair is too little work to share: a thread for each of several pairs is twice as fast.
+        threads_of_their_own(usable_processors()) as pool,
+    ):
+        for group in np.split(pairs, starts[1:]):
+            start = time.perf_counter()
+            one = read(int(group[0, 0]))
+            others = [read(int(j)) for j in group[:, 1]]
+            counts = list(pool.map(lambda other, one=one: agreeing(one, other), others))
+            share = (time.perf_counter() - start) / len(group)
+            for (i, j), count in zip(numbers[group].tolist(), counts, strict=True):
+                rows.append((min(i, j), max(i, j), count, share))
+            if len(rows) - kept >= KEEP_PAIRS:
+                store.add_agreements(rows[kept:])
+                kept = len(rows)
+            bar.advance(len(group))
+    store.add_agreements(rows[kept:])
+    return rows
