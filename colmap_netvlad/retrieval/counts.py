@@ -82,9 +82,8 @@ class Counts(Generic[Kind]):
         keys = _joined(np.sort(self.numbers[pairs], axis=1))
         missing = ~np.isin(keys, self._keys)
         if missing.any():
-            self._add(
-                _compare(pairs[missing], self.numbers, self._store, self._read, self._agreeing)
-            )
+            new = pairs[missing]
+            self._add(_compare(new, self.numbers, self._store, self._latest, self._agreeing))
         at = np.searchsorted(self._keys, keys)
         matches = np.zeros(len(has), np.int64)
         matches[has] = self._matches[at]
