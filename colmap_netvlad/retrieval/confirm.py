@@ -73,7 +73,9 @@ class Largest:
         """Choose from features as COLMAP's database keeps them."""
         scale, angle = scale_and_angle(keypoints)
         good = np.isfinite(keypoints).all(axis=1) & (scale > 0)
-        order = np.argsort(-np.where(good, scale, 0), kind="stable")[: min(LARGEST, good.sum())]
+        order = np.flatnonzero(good)
+        if len(order) > LARGEST:
+            order = np.sort(order[np.argpartition(-scale[order], LARGEST)[:LARGEST]])
         at = keypoints[order, :2]
         codes = operand(np.rint(descriptors[order] / 2).clip(0, 127).astype(np.int8))
         return cls(
