@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from colmap_netvlad.retrieval.places import Places, agreeing_matches
 from colmap_netvlad.retrieval.rerank import (
     ASK,
     CHANCE,
+    FEATURES_PATIENCE,
     PATIENCE,
     SURE,
     rerank,
@@ -165,7 +167,12 @@ CIRCLE = 90
 def compared_in_a_circle(tmp_path: Path, monkeypatch):
     """Return a function: matches that agree of pairs -> (the pairs compared, the ranking)."""
 
-    def run(agreeing: dict[tuple[int, int], int], otherwise: int = 0, depth: int = CIRCLE - 1):
+    def run(
+        agreeing: dict[tuple[int, int], int],
+        otherwise: int = 0,
+        depth: int = CIRCLE - 1,
+        features: SimpleNamespace | None = None,
+    ):
         pairs = set()
 
         def count(one: Places, other: Places) -> int:
@@ -181,7 +188,8 @@ def compared_in_a_circle(tmp_path: Path, monkeypatch):
         scores = np.tile(1 / after.astype(np.float32), (CIRCLE, 1))
         with Store(tmp_path / "circle.db") as store:
             store.add_descriptors("m", names, names, np.zeros((CIRCLE, 4)), 0, cells)
-            ranking = rerank(Ranking(names, partners, scores, "circle"), store, "m", 5, depth)
+            candidates = Ranking(names, partners, scores, "circle")
+            ranking = rerank(candidates, store, "m", 5, depth, features)
         return pairs, ranking
 
     return run
@@ -209,6 +217,18 @@ def test_who_finds_nothing_more_stops_asking(compared_in_a_circle) -> None:
     assert pairs == asked_by_all(ASK + PATIENCE)
     assert set(ranking.partners[7, :2]) == {6, 8}
     assert ranking.partners.shape == (CIRCLE, CIRCLE - 1), "the others follow in their own order"
+
+
+def test_where_features_are_asked_as_well_who_finds_nothing_more_stops_sooner(
+    compared_in_a_circle,
+) -> None:
+    after = {
+        (min(pair), max(pair)): SURELY
+        for apart in (1, 2)
+        for pair in ((i, (i + apart) % CIRCLE) for i in range(CIRCLE))
+    }
+    pairs, _ = compared_in_a_circle(after, features=SimpleNamespace(fingerprints={}))
+    assert pairs == asked_by_all(ASK + FEATURES_PATIENCE)
 
 
 def test_who_finds_a_sure_partner_late_goes_on_from_there(compared_in_a_circle) -> None:

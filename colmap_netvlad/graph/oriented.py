@@ -79,14 +79,22 @@ def _complex(at: NDArray[np.float32]) -> NDArray[np.complex64]:
     return at[:, 0] + np.complex64(1j) * at[:, 1]
 
 
-def scale_and_angle(
-    keypoints: NDArray[np.float32],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return (N,) scale and orientation; 1 and 0 where keypoints have none."""
+def scales(keypoints: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Return (N,) scale of keypoints as COLMAP's database keeps them; 1 where they have none."""
     shape = keypoints[:, 2:].astype(np.float64)
     if shape.shape[1] == 2:
-        return shape[:, 0], shape[:, 1]
+        return shape[:, 0]
     if shape.shape[1] == 4:
         a11, a12, a21, a22 = shape.T
-        return np.sqrt(np.abs(a11 * a22 - a12 * a21)), np.arctan2(a21, a11)
-    return np.ones(len(shape)), np.zeros(len(shape))
+        return np.sqrt(np.abs(a11 * a22 - a12 * a21))
+    return np.ones(len(shape))
+
+
+def angles(keypoints: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Return (N,) orientation of such keypoints, rad; 0 where they have none."""
+    shape = keypoints[:, 2:].astype(np.float64)
+    if shape.shape[1] == 2:
+        return shape[:, 1]
+    if shape.shape[1] == 4:
+        return np.arctan2(shape[:, 2], shape[:, 0])
+    return np.zeros(len(shape))

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from colmap_netvlad.flight import Flight
-from colmap_netvlad.graph.oriented import agreements, scale_and_angle
+from colmap_netvlad.graph.oriented import agreements, angles, scales
 from colmap_netvlad.runtime.products import operand, products
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ class Largest:
     @classmethod
     def of(cls, keypoints: NDArray[np.float32], descriptors: NDArray[np.uint8]) -> Largest:
         """Choose from features as COLMAP's database keeps them."""
-        scale, angle = scale_and_angle(keypoints)
+        scale = scales(keypoints)
         good = np.isfinite(keypoints).all(axis=1) & (scale > 0)
         order = np.flatnonzero(good)
         if len(order) > LARGEST:
@@ -81,7 +81,7 @@ class Largest:
         return cls(
             at,
             np.log(scale[order]).astype(np.float32),
-            angle[order].astype(np.float32),
+            angles(keypoints[order]).astype(np.float32),
             codes,
             _least(at, codes),
         )

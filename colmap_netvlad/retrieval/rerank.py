@@ -55,14 +55,17 @@ ASK = 10
 """Candidates that an image asks for at a time."""
 
 PATIENCE = 20
-"""An image asks no more after so many candidates in a row that were no sure partners."""
+FEATURES_PATIENCE = 10
+"""An image asks no more after so many candidates in a row that were no sure partners; the second where
+features are asked as well, which tell weak partners."""
 
 SURE = 10
 """More matches beyond chance than this make a sure partner."""
 
 SURE_PARTNERS = 2
+FEATURES_SURE_PARTNERS = 3
 """Who has fewer sure partners asks on: what hardly overlaps with any other is not to be missed.
-What these four were chosen by: docs/training-log.md, section 10."""
+What these were chosen by: docs/training-log.md, sections 10 and 17."""
 
 TAIL = 1e-3
 """Weight of the candidates' own order, which decides where nothing agrees."""
@@ -78,8 +81,8 @@ def rerank(
 ) -> Ranking:
     """Return a ranking as deep as the candidates', at most `depth` of them compared place by place.
 
-    Each image asks for its best candidates, `ASK` at a time, until `PATIENCE` in a row were no
-    sure partners, or to the end where it has hardly any. What was learned so far chooses: a
+    Each image asks for its best candidates, `ASK` at a time, until some in a row were no sure
+    partners, or to the end where it has hardly any. What was learned so far chooses: a
     neighbour whom the descriptors overlooked is found by way of its neighbours. Counts are kept
     in the store: pairs compared before are not compared again.
 
@@ -93,6 +96,8 @@ def rerank(
     counted = _Counted(store, model, candidates, features)
     own = TAIL * _own_order(candidates)
     similarity, seconds = own, 0.0
+    patience = PATIENCE if features is None else FEATURES_PATIENCE
+    partners = SURE_PARTNERS if features is None else FEATURES_SURE_PARTNERS
     most = np.full(len(candidates.names), min(ASK, depth - depth // 2), np.intp)
     asks, left, quiet = most, np.full_like(most, depth), np.zeros_like(most)
     with step("Comparing photos place by place", len(asks)) as bar:
@@ -106,7 +111,7 @@ def rerank(
             sure = agreement > SURE
             found = (chosen > 0).multiply(sure).sum(axis=1) > 0
             quiet = np.where(found, 0, quiet + asks)
-            goes_on = (quiet < PATIENCE) | (sure.sum(axis=1) < SURE_PARTNERS)
+            goes_on = (quiet < patience) | (sure.sum(axis=1) < partners)
             left = left - asks
             asked, asks = asks, np.where((asks > 0) & goes_on, np.minimum(most, left), 0)
             bar.advance(int(np.count_nonzero(asked) - np.count_nonzero(asks)))
