@@ -56,8 +56,8 @@ ASK = 10
 
 PATIENCE = 20
 FEATURES_PATIENCE = 10
-"""An image asks no more after so many candidates in a row that were no sure partners; the second where
-features are asked as well, which tell weak partners."""
+"""An image asks no more after so many candidates in a row that were no sure partners; the second
+number holds where features are asked as well, which tell weak partners."""
 
 SURE = 10
 """More matches beyond chance than this make a sure partner."""
