@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from numpy.typing import NDArray
 
 from colmap_netvlad.cache.cells import Cells
@@ -23,7 +24,9 @@ from colmap_netvlad.retrieval.confirm import (
     largest_features,
 )
 from colmap_netvlad.retrieval.options import RetrievalOptions
+from colmap_netvlad.retrieval.places import Places, agreeing_matches
 from colmap_netvlad.retrieval.rerank import FEATURES_BY_CHANCE, PLENTY, rerank
+from colmap_netvlad.runtime import products
 
 MakeProject = Callable[..., Project]
 
@@ -108,6 +111,25 @@ def test_keypoints_that_are_not_finite_and_photos_without_features_confirm_nothi
     assert len(photo.at) == agreeing_features(photo, photo) == 10
     none = Largest.of(keypoints[:0], descriptors[:0])
     assert agreeing_features(photo, none) == agreeing_features(none, photo) == 0
+
+
+def test_machines_that_multiply_floats_faster_find_the_same(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    counts = []
+    for kind in (torch.int8, torch.float32):
+        monkeypatch.setattr(products, "bytes_or_floats", lambda kind=kind: kind)
+        one, other = ground(0), seen(ground(0), 1.0, 0.8, 30)
+        cells = [Cells.of(np.random.default_rng(s).normal(size=(16, 9, 9))) for s in (0, 0, 1)]
+        places = [Places.of(grid) for grid in cells]
+        counts.append(
+            (
+                agreeing_features(Largest.of(*one), Largest.of(*other)),
+                agreeing_matches(places[0], places[1]),
+                agreeing_matches(places[0], places[2]),
+            )
+        )
+    assert counts[0] == counts[1]
 
 
 class Kept:

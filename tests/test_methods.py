@@ -137,7 +137,7 @@ def test_new_and_changed_photos_alone_are_computed(
     # The copy now lies nearest to its original; the database has the features of before.
     alone = rank(project, checkpoint, RetrievalOptions(k=4, rerank=0))
     assert alone.partners[2, 0] == 1
-    assert second.partners[1, 0] == 2
+    assert alone.partners[1, 0] == 2
 
 
 def test_bad_photos_are_left_out_with_a_reason_and_stop_nothing(
