@@ -25,6 +25,7 @@ from colmap_netvlad.photos.folders import photo_folders
 from colmap_netvlad.photos.masks import find_mask
 from colmap_netvlad.retrieval.described import cache_note, missing, rank_described
 from colmap_netvlad.retrieval.options import RetrievalOptions
+from colmap_netvlad.retrieval.words import rank_in_words, serves
 from colmap_netvlad.runtime import workers
 from colmap_netvlad.runtime.errors import InputError
 from colmap_netvlad.runtime.jobs import Enclosed, Load
@@ -41,7 +42,8 @@ def candidates(
 ) -> Ranking:
     """Rank by a model's descriptors; see `describe_photos`.
 
-    Photos that cannot be used have no partners and are listed with a reason.
+    A flight of more photos than are compared with each is described in words of its own
+    (`retrieval.words`). Photos that cannot be used have no partners and are listed with a reason.
 
     Args:
         flight: its photo folder must be known.
@@ -52,7 +54,9 @@ def candidates(
     """
     key, left_out, note = describe_photos(flight, options, name_or_path)
     method = Path(name_or_path).stem if Path(name_or_path).suffix else str(name_or_path)
-    return rank_described(flight.store, key, flight.names, left_out, options, depth, method, [note])
+    photos = len(flight.names) - len(left_out)
+    rank = rank_in_words if serves(options, photos) else rank_described
+    return rank(flight.store, key, flight.names, left_out, options, depth, method, [note])
 
 
 def describe_photos(
