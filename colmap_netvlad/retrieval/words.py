@@ -90,9 +90,14 @@ def rank_in_words(
     described = [name for name in names if name not in left_out]
     numbers = store.cell_numbers(model)
     cells = [numbers[name] for name in described]
-    vectors = in_words(
-        lambda photo: store.read_cells(cells[photo]), store.vectors(model, described), options.seed
-    )
+
+    def read(photo: int) -> Cells:
+        return store.read_cells(cells[photo])
+
+    words = Words.learn(read, len(cells), options.seed)
+    share = models_share(len(words.centres))
+    codes = describe(words, read, len(cells))
+    vectors = InWords(codes, store.vectors(model, described), share)
     found = rank_vectors(vectors, names, left_out, options, depth, method)
     similarity = expand(
         similarity_matrix(found), EXPANSION_NEIGHBOURS, EXPANSION_SHARE, found.depth
@@ -103,7 +108,7 @@ def rank_in_words(
         seconds_describe=store.seconds(model, described),
         seconds_search=time.perf_counter() - start,
         left_out=found.left_out,
-        notes=(*notes, f"candidates by {vectors.words:,} words of the flight's own"),
+        notes=(*notes, f"candidates by {len(words.centres):,} words of the flight's own"),
     )
 
 
@@ -167,13 +172,17 @@ class InWords:
 
     Attributes:
         shape: (N, D).
-        words: K.
     """
 
-    def __init__(self, codes: NDArray[np.int8], words: int, models: Vectors) -> None:
-        """Join descriptors in K words with the model's, which are read as they are sliced."""
-        self._codes, self._models, self.words = codes, models, words
-        share = (MODELS_SHARE / words) ** 2 if words < MOST_WORDS else 0.0
+    def __init__(self, codes: NDArray[np.int8], models: Vectors, share: float) -> None:
+        """Join descriptors in words with the model's, which are read as they are sliced.
+
+        Args:
+            codes: (N, K A) of `Words.describe`.
+            models: (N, D) L2-normalised.
+            share: weight of the model's cosines beside those in words; 0: they are left out.
+        """
+        self._codes, self._models = codes, models
         self._weights = np.sqrt(np.array([1.0, share]) / (1.0 + share)).astype(np.float32)
         self.shape = (len(codes), codes.shape[1] + (models.shape[1] if share else 0))
 
@@ -184,19 +193,13 @@ class InWords:
         return np.hstack([own, self._weights[1] * self._models[rows]])
 
 
-def in_words(read: Read, models: Vectors, seed: int) -> InWords:
-    """Describe the photos of a flight in its own words.
+def models_share(words: int) -> float:
+    """Return the weight of the model's cosines beside those in so many words."""
+    return (MODELS_SHARE / words) ** 2 if words < MOST_WORDS else 0.0
 
-    Args:
-        read: the cells of each photo.
-        models: (N, D) the model's descriptors of the photos.
-        seed: of the words.
 
-    Returns:
-        (N, D') L2-normalised descriptors.
-    """
-    photos = models.shape[0]
-    words = Words.learn(read, photos, seed)
+def describe(words: Words, read: Read, photos: int) -> NDArray[np.int8]:
+    """Return (N, K A) the descriptors of all photos in these words, a byte a value."""
     codes = np.empty((photos, words.centres.size), np.int8)
     with (
         step("Describing photos in the flight's own words", photos) as bar,
@@ -208,7 +211,7 @@ def in_words(read: Read, models: Vectors, seed: int) -> InWords:
             cells = [read(photo) for photo in range(photos)[rows]]
             codes[rows] = list(pool.map(words.describe, cells))
             bar.advance(len(cells))
-    return InWords(codes, len(words.centres), models)
+    return codes
 
 
 def _sample(read: Read, photos: int, count: int, seed: int) -> NDArray[np.float32]:
