@@ -117,7 +117,7 @@ def test_photos_left_out_have_no_partners_and_are_nobodys(tmp_path: Path) -> Non
             RetrievalOptions(),
             10,
             "deep",
-            ["12 of 12"],
+            ["39 of 39"],
         )
     assert ranking.partners.shape == (PHOTOS, 10)
     assert (ranking.partners[0] == NO_PARTNER).all() and not (ranking.partners[1:] == 0).any()
