@@ -52,8 +52,6 @@ ray_tasks = pytest.importorskip("colmap_netvlad.runtime.ray_tasks")
 ray_files = pytest.importorskip("colmap_netvlad.runtime.ray_files")
 cluster_utils = pytest.importorskip("ray.cluster_utils")
 
-pytestmark = pytest.mark.xdist_group("ray")
-
 MakeProject = Callable[..., Project]
 LEAVE_SECONDS = 5.0
 """Ctrl-C takes less than 2 s; a busy machine has some more."""
