@@ -36,6 +36,9 @@ class Seen(Protocol):
 
 Kind = TypeVar("Kind", bound=Seen)
 
+Known = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]
+"""What the store has counted (`Store.agreements`)."""
+
 Rows = list[tuple[int, int, int, float]]
 """Numbers of two images, lower first; how much agrees; seconds."""
 
@@ -50,6 +53,7 @@ class Counts(Generic[Kind]):
     def __init__(
         self,
         store: Store,
+        known: Known,
         numbers: NDArray[np.int64],
         read: Callable[[int], Kind],
         agreeing: Callable[[Kind, Kind], int],
@@ -57,12 +61,13 @@ class Counts(Generic[Kind]):
         """Start from what the store has.
 
         Args:
+            known: of all kinds of features; theirs are told apart by their numbers.
             read: an image's features, by its index.
             agreeing: how much agrees in two images.
         """
         self.numbers = numbers
         self._store, self._read, self._agreeing = store, read, agreeing
-        pairs, self._matches, self._seconds = store.agreements()
+        pairs, self._matches, self._seconds = known
         self._keys = _joined(pairs)
 
     def has(self, pairs: Pairs) -> NDArray[np.bool_]:

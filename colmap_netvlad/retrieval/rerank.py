@@ -27,7 +27,7 @@ from colmap_netvlad.retrieval.confirm import (
     LargestFeatures,
     agreeing_features,
 )
-from colmap_netvlad.retrieval.counts import Counts, Pairs
+from colmap_netvlad.retrieval.counts import Counts, Known, Pairs
 from colmap_netvlad.retrieval.fusion import expand, keep_best, ranking_of
 from colmap_netvlad.retrieval.options import COMPARED
 from colmap_netvlad.retrieval.places import Places, agreeing_matches
@@ -151,8 +151,11 @@ class _Counted:
     ) -> None:
         left_out = {name for name, _ in candidates.left_out}
         names = ["" if name in left_out else name for name in candidates.names]
-        self._places = _counts_of_places(store, model, names)
-        self._features = None if features is None else _counts_of_features(store, features, names)
+        known = store.agreements()  # once: a million pairs of 20,000 images
+        self._places = _counts_of_places(store, known, model, names)
+        self._features = (
+            None if features is None else _counts_of_features(store, known, features, names)
+        )
         self._pairs = np.zeros((0, 2), np.intp)
         self._beyond = np.zeros(0)
 
@@ -190,20 +193,26 @@ class _Counted:
         return (upper + upper.T).tocsr()
 
 
-def _counts_of_places(store: Store, model: str, names: Sequence[str]) -> Counts[Places]:
+def _counts_of_places(
+    store: Store, known: Known, model: str, names: Sequence[str]
+) -> Counts[Places]:
     numbers = _in_order(store.cell_numbers(model), names)
     return Counts(
-        store, numbers, lambda i: Places.of(store.read_cells(int(numbers[i]))), agreeing_matches
+        store,
+        known,
+        numbers,
+        lambda i: Places.of(store.read_cells(int(numbers[i]))),
+        agreeing_matches,
     )
 
 
 def _counts_of_features(
-    store: Store, features: LargestFeatures, names: Sequence[str]
+    store: Store, known: Known, features: LargestFeatures, names: Sequence[str]
 ) -> Counts[Largest]:
     store.number(LARGEST_FEATURES, features.fingerprints)
-    known = store.cell_numbers(LARGEST_FEATURES)
-    numbers = _in_order({name: known[name] for name in features.fingerprints}, names)
-    return Counts(store, numbers, lambda i: features.read(names[i]), agreeing_features)
+    given = store.cell_numbers(LARGEST_FEATURES)
+    numbers = _in_order({name: given[name] for name in features.fingerprints}, names)
+    return Counts(store, known, numbers, lambda i: features.read(names[i]), agreeing_features)
 
 
 def _in_order(numbers: Mapping[str, int], names: Sequence[str]) -> NDArray[np.int64]:
