@@ -90,6 +90,12 @@ def scales(keypoints: NDArray[np.float32]) -> NDArray[np.float64]:
     return np.ones(len(shape))
 
 
+def usable(keypoints: NDArray[np.float32], scale: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return (N,) which of such keypoints are whole: all of it finite, and the scale positive."""
+    whole: NDArray[np.bool_] = np.isfinite(keypoints).all(axis=1) & (scale > 0)
+    return whole
+
+
 def angles(keypoints: NDArray[np.float32]) -> NDArray[np.float64]:
     """Return (N,) orientation of such keypoints, rad; 0 where they have none."""
     shape = keypoints[:, 2:].astype(np.float64)

@@ -12,7 +12,7 @@ from zlib import crc32
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_netvlad.graph.oriented import angles, scales
+from colmap_netvlad.graph.oriented import angles, scales, usable
 from colmap_netvlad.matching.nearest import Codes
 
 SIFT_BYTES = 128
@@ -69,7 +69,7 @@ def prepare(keypoints: NDArray[np.float32], descriptors: NDArray[np.uint8]) -> S
     if descriptors.shape[1] != SIFT_BYTES or descriptors.dtype != np.uint8:
         raise ValueError(f"descriptors are not SIFT's {SIFT_BYTES} bytes")
     scale, angle = scales(keypoints), angles(keypoints)
-    good = np.isfinite(keypoints).all(axis=1) & (scale > 0)
+    good = usable(keypoints, scale)
     at = np.where(good[:, None], keypoints[:, :2], np.nan).astype(np.float32)
     if not good.all():
         descriptors = np.where(good[:, None], descriptors, np.uint8(0))

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from colmap_netvlad.flight import Flight
-from colmap_netvlad.graph.oriented import agreements, angles, scales
+from colmap_netvlad.graph.oriented import agreements, angles, scales, usable
 from colmap_netvlad.runtime.products import operand, products
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ class Largest:
     def of(cls, keypoints: NDArray[np.float32], descriptors: NDArray[np.uint8]) -> Largest:
         """Choose from features as COLMAP's database keeps them."""
         scale = scales(keypoints)
-        good = np.isfinite(keypoints).all(axis=1) & (scale > 0)
+        good = usable(keypoints, scale)
         order = np.flatnonzero(good)
         if len(order) > LARGEST:
             order = np.sort(order[np.argpartition(-scale[order], LARGEST)[:LARGEST]])
