@@ -1,4 +1,4 @@
-"""The largest SIFT features confirm pairs of which few places agree, and are asked once."""
+"""The largest SIFT features tell which photos show the same ground, and are asked once."""
 
 from __future__ import annotations
 
@@ -17,15 +17,18 @@ from colmap_netvlad.colmap.database import Database
 from colmap_netvlad.commands.pairs import make_pairs
 from colmap_netvlad.flight import open_flight
 from colmap_netvlad.project import Project
+from colmap_netvlad.retrieval import rerank as module
 from colmap_netvlad.retrieval.confirm import (
+    LARGEST,
     LARGEST_FEATURES,
+    MOST_ASKED,
     Largest,
     agreeing_features,
     largest_features,
 )
 from colmap_netvlad.retrieval.options import RetrievalOptions
 from colmap_netvlad.retrieval.places import Places, agreeing_matches
-from colmap_netvlad.retrieval.rerank import FEATURES_BY_CHANCE, PLENTY, rerank
+from colmap_netvlad.retrieval.rerank import FEATURES_BY_CHANCE, rerank
 from colmap_netvlad.runtime import products
 
 MakeProject = Callable[..., Project]
@@ -61,13 +64,22 @@ def seen(features: Features, turn: float, scaling: float, shift: float) -> Featu
 @pytest.mark.parametrize(("turn", "scaling"), [(0.0, 1.0), (2.5, 1.0), (-1.2, 0.6), (3.1, 1.7)])
 def test_all_features_of_one_ground_agree_however_it_was_seen(turn: float, scaling: float) -> None:
     one = ground(0)
-    assert agreeing_features(Largest.of(*one), Largest.of(*seen(one, turn, scaling, 80))) >= 60
+    other = seen(one, turn, scaling, 80)
+    assert agreeing_features(Largest.of(*one), Largest.of(*other)) == 200 > MOST_ASKED
 
 
 def test_features_of_different_ground_agree_by_chance_only() -> None:
     photos = [Largest.of(*ground(seed)) for seed in range(6)]
     counts = [agreeing_features(one, other) for one in photos for other in photos if one != other]
     assert max(counts) <= FEATURES_BY_CHANCE
+
+
+def test_the_largest_features_lie_word_after_word() -> None:
+    photo = Largest.of(*ground(0, 3000))
+    assert len(photo.at) == LARGEST
+    ends = [word.stop for word in photo.words]
+    assert [0, *ends[:-1]] == [word.start for word in photo.words] and ends[-1] == LARGEST
+    assert [len(codes) for codes in photo.codes] == [w.stop - w.start for w in photo.words]
 
 
 def test_what_looks_alike_but_lies_elsewhere_does_not_agree() -> None:
@@ -91,17 +103,17 @@ def test_one_place_seen_in_two_ways_still_confirms() -> None:
     keypoints, descriptors = ground(0)
     twice = np.concatenate([keypoints, keypoints + np.float32([0.5, 0, 0, 0.2])])
     photo = Largest.of(twice, np.concatenate([descriptors, descriptors]))
-    assert agreeing_features(photo, photo) >= 60
+    assert agreeing_features(photo, photo) == 200
 
 
 @pytest.mark.parametrize("columns", [2, 4, 6])
 def test_keypoints_of_every_form_are_read(columns: int) -> None:
-    keypoints, descriptors = ground(0, 40)
+    keypoints, descriptors = ground(0, 30)
     scale, angle = keypoints[:, 2:].T
     shape = np.stack([np.cos(angle), -np.sin(angle), np.sin(angle), np.cos(angle)], axis=1)
     whole = np.column_stack([keypoints[:, :2], shape * scale[:, None]]).astype(np.float32)
     photo = Largest.of({2: keypoints[:, :2], 4: keypoints, 6: whole}[columns], descriptors)
-    assert agreeing_features(photo, photo) == 40
+    assert agreeing_features(photo, photo) == 30
 
 
 def test_keypoints_that_are_not_finite_and_photos_without_features_confirm_nothing() -> None:
@@ -176,14 +188,11 @@ def test_a_pair_that_places_do_not_tell_is_found_by_its_features(store: Store) -
     assert ranking.partners[0, 0] == 5 and ranking.partners[5, 0] == 0
 
 
-def test_where_places_leave_no_doubt_no_feature_is_read(tmp_path: Path) -> None:
-    cells = [Cells.of(np.random.default_rng(0).normal(size=(16, 12, 12)))] * 6
-    assert len(cells[0].places()) > PLENTY
-    kept = Kept(of_one_ground())
-    with Store(tmp_path / "project.netvlad.db") as store:
-        store.add_descriptors("m", NAMES, NAMES, np.zeros((6, 4), np.float32), 0, cells)
-        rerank(in_order(), store, "m", 5, features=kept)
-    assert kept.read_of == []
+def test_photos_that_have_features_are_not_compared_by_their_places(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "agreeing_matches", lambda *_: pytest.fail("compared"))
+    rerank(in_order(), store, "m", 5, features=Kept(of_one_ground("0.jpg", "5.jpg")))
 
 
 def test_features_are_asked_once_and_again_where_they_changed(store: Store) -> None:

@@ -22,13 +22,14 @@ from colmap_netvlad.retrieval import rerank as module
 from colmap_netvlad.retrieval.options import COMPARED, RetrievalOptions
 from colmap_netvlad.retrieval.places import Places, agreeing_matches
 from colmap_netvlad.retrieval.rerank import (
-    ASK,
+    BY_FEATURES,
+    BY_PLACES,
     CHANCE,
-    FEATURES_PATIENCE,
-    PATIENCE,
     SURE,
     rerank,
 )
+
+ASK, PATIENCE = BY_PLACES.at_a_time, BY_PLACES.patience
 
 SIDE, STEP, PHOTOS = 12, 4, 9
 """A strip of ground seen by photos of SIDE x SIDE cells, each STEP cells after the one before."""
@@ -205,7 +206,7 @@ def asked_by_all(most: int) -> set[tuple[int, int]]:
     return set().union(*(circle_pairs(i, range(1, most + 1)) for i in range(CIRCLE)))
 
 
-SURELY = CHANCE + SURE + 1
+SURELY = SURE + 1
 NEXT_TO_EACH_OTHER = {
     (min(pair), max(pair)): SURELY for pair in ((i, (i + 1) % CIRCLE) for i in range(CIRCLE))
 }
@@ -219,7 +220,7 @@ def test_who_finds_nothing_more_stops_asking(compared_in_a_circle) -> None:
     assert ranking.partners.shape == (CIRCLE, CIRCLE - 1), "the others follow in their own order"
 
 
-def test_where_features_are_asked_as_well_who_finds_nothing_more_stops_sooner(
+def test_where_there_are_features_who_finds_nothing_more_stops_sooner(
     compared_in_a_circle,
 ) -> None:
     after = {
@@ -228,7 +229,7 @@ def test_where_features_are_asked_as_well_who_finds_nothing_more_stops_sooner(
         for pair in ((i, (i + apart) % CIRCLE) for i in range(CIRCLE))
     }
     pairs, _ = compared_in_a_circle(after, features=SimpleNamespace(fingerprints={}))
-    assert pairs == asked_by_all(ASK + FEATURES_PATIENCE)
+    assert pairs == asked_by_all(BY_FEATURES.at_a_time + BY_FEATURES.patience)
 
 
 def test_who_finds_a_sure_partner_late_goes_on_from_there(compared_in_a_circle) -> None:

@@ -47,14 +47,32 @@ class Oriented(Protocol):
 
 def agreements(one: Oriented, other: Oriented, matches: Matches) -> NDArray[np.bool_]:
     """Return (M, M) whether two matches each lie where the other predicts; of itself, True."""
-    i, j = matches.T
-    turn, scaling = other.angle[j] - one.angle[i], other.log_scale[j] - one.log_scale[i]
-    turns = np.abs(turn[:, None] - turn)
-    turns = np.minimum(turns % (2 * np.pi), 2 * np.pi - turns % (2 * np.pi))
-    alike = (turns < TURN) & (np.abs(scaling[:, None] - scaling) < SCALING)
+    alike = _alike(one, other, matches, matches)
     rows, columns = np.nonzero(alike)
     alike[rows, columns] = predicted(one, other, matches, rows, columns)
     return alike & alike.T
+
+
+def agreeing_with(
+    one: Oriented, other: Oriented, matches: Matches, place: int
+) -> NDArray[np.bool_]:
+    """Return (M,) that row of `agreements`."""
+    agree = _alike(one, other, matches[place : place + 1], matches)[0]
+    others = np.flatnonzero(agree)
+    this = np.full_like(others, place)
+    agree[others] = predicted(one, other, matches, this, others)
+    agree[others] &= predicted(one, other, matches, others, this)
+    return agree
+
+
+def _alike(one: Oriented, other: Oriented, matches: Matches, others: Matches) -> NDArray[np.bool_]:
+    """Return (M, N) whether matches are turned and scaled alike."""
+    turn, scaling = _turn_and_scaling(one, other, matches)
+    turn_of_others, scaling_of_others = _turn_and_scaling(one, other, others)
+    alike = np.outer(np.cos(turn), np.cos(turn_of_others))
+    alike += np.outer(np.sin(turn), np.sin(turn_of_others))
+    near: NDArray[np.bool_] = np.abs(scaling[:, None] - scaling_of_others) < SCALING
+    return near & (alike > np.cos(TURN))
 
 
 def predicted(
@@ -66,13 +84,20 @@ def predicted(
 ) -> NDArray[np.bool_]:
     """Return whether the matches `columns` lie where the matches `rows` predict."""
     i, j = matches.T
-    turn, scaling = other.angle[j] - one.angle[i], other.log_scale[j] - one.log_scale[i]
+    turn, scaling = _turn_and_scaling(one, other, matches)
     similarity = np.exp(scaling + 1j * turn).astype(np.complex64)
     from_place, to_place = _complex(one.at[i]), _complex(other.at[j])
     moved = to_place[columns] - to_place[rows]
     off = np.abs(similarity[rows] * (from_place[columns] - from_place[rows]) - moved)
     near: NDArray[np.bool_] = np.less(off, SHIFT + STRETCH * np.abs(moved))
     return near
+
+
+def _turn_and_scaling(
+    one: Oriented, other: Oriented, matches: Matches
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    i, j = matches.T
+    return other.angle[j] - one.angle[i], other.log_scale[j] - one.log_scale[i]
 
 
 def _complex(at: NDArray[np.float32]) -> NDArray[np.complex64]:

@@ -4,11 +4,17 @@ Cells tell a piece of ground from another by what it is; where all of it is alik
 water) few of them agree on the right transform. There the features that matching goes by help: the
 largest are few, each says by itself how one photo lies in the other (`graph.oriented`), and those
 that match by chance do not agree.
+
+Each is looked for among those of its own word alone: a match falls on one word in both photos, or
+is lost, and all products together are an eighth of those of all features with all.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,17 +22,20 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from colmap_netvlad.flight import Flight
-from colmap_netvlad.graph.oriented import agreements, angles, scales, usable
+from colmap_netvlad.graph.oriented import agreeing_with, agreements, angles, scales, usable
 from colmap_netvlad.runtime.products import operand, products
 
 if TYPE_CHECKING:
     import torch
 
-LARGEST_FEATURES = "largest SIFT features"
-"""What the store numbers them under."""
+LARGEST_FEATURES = "2,000 largest SIFT features"
+"""What the store numbers them under: counts of other features have other numbers."""
 
-LARGEST = 800
+LARGEST = 2000
 """Features of a photo, those of the largest scales, which photos of other heights show too."""
+
+WORDS_FILE = "sift_words.npy"
+"""(W, 128) int8, mean directions of SIFT descriptors (`scripts/make_sift_words.py`)."""
 
 RATIO = 0.9
 MAX_ANGLE = 0.7
@@ -37,69 +46,78 @@ serves as well as the ratio to the second nearest of each other photo."""
 SAME_PLACE = 3.0
 """Features of one photo nearer than this (pixels) are one place seen in two ways."""
 
-MOST_ASKED = 64
-"""Matches asked at most, the most alike."""
+MOST_ASKED = 32
+"""Matches asked where others lie, the most alike: with more of them chance has more chances."""
+
+HALVED = np.rint(np.arange(256) / 2).clip(0, 127).astype(np.int8)
+"""Each value of a descriptor halved, so that its bytes are signed ones."""
 
 UNIT = 256.0
-"""Length of halved descriptors: of COLMAP's 512, so that their bytes are signed ones."""
+"""Length of halved descriptors: COLMAP's have 512."""
 
 
 @dataclass(frozen=True, eq=False)
 class Largest:
-    """The N largest features of a photo.
+    """The N largest features of a photo, word after word.
 
     Attributes:
         at: (N, 2) x, y, pixels.
         log_scale: (N,) natural logarithm of the scale.
         angle: (N,) orientation, rad.
-        codes: (N, 128) halved descriptors.
+        words: where each word's features are, of W words.
+        codes: (n, 128) halved descriptors of each word.
         least: (N,) the product of halved descriptors that a match must exceed.
     """
 
     at: NDArray[np.float32]
     log_scale: NDArray[np.float32]
     angle: NDArray[np.float32]
-    codes: torch.Tensor
+    words: tuple[slice, ...]
+    codes: tuple[torch.Tensor, ...]
     least: NDArray[np.int32]
 
     @property
     def nbytes(self) -> int:
         """Memory they take."""
-        fields = (self.at, self.log_scale, self.angle, self.codes, self.least)
-        return sum(field.nbytes for field in fields)
+        arrays = (self.at, self.log_scale, self.angle, self.least)
+        return sum(a.nbytes for a in arrays) + sum(codes.nbytes for codes in self.codes)
 
     @classmethod
     def of(cls, keypoints: NDArray[np.float32], descriptors: NDArray[np.uint8]) -> Largest:
         """Choose from features as COLMAP's database keeps them."""
         scale = scales(keypoints)
-        good = usable(keypoints, scale)
-        order = np.flatnonzero(good)
+        order = np.flatnonzero(usable(keypoints, scale))
         if len(order) > LARGEST:
             order = np.sort(order[np.argpartition(-scale[order], LARGEST)[:LARGEST]])
-        at = keypoints[order, :2]
-        codes = operand(np.rint(descriptors[order] / 2).clip(0, 127).astype(np.int8))
+        halved = HALVED[descriptors[order]]
+        by_word, words = _by_word(halved)
+        order, halved = order[by_word], halved[by_word]
+        at, codes = keypoints[order, :2], tuple(operand(halved[word]) for word in words)
         return cls(
             at,
             np.log(scale[order]).astype(np.float32),
             angles(keypoints[order]).astype(np.float32),
+            words,
             codes,
-            _least(at, codes),
+            _least(at, words, codes),
         )
 
 
 def agreeing_features(one: Largest, other: Largest) -> int:
-    """Return how many matches agree with the one that most agree with, itself included."""
+    """Return how many matches agree with one of the most alike, itself included: the one that most
+    of these agree with."""
     if min(len(one.at), len(other.at)) == 0:
         return 0
-    alike = products(one.codes, other.codes)
-    j = alike.argmax(axis=1)
-    alike = alike[np.arange(len(j)), j]
+    j, alike = _most_alike(one, other)
     i = np.flatnonzero((alike > one.least) & (alike > other.least[j]))
+    if not len(i):
+        return 0
     # The most alike first; each feature of the other photo once.
     i = i[np.argsort(-alike[i], kind="stable")]
-    i = i[np.sort(np.unique(j[i], return_index=True)[1])][:MOST_ASKED]
+    i = i[np.sort(np.unique(j[i], return_index=True)[1])]
     matches = np.stack([i, j[i]], axis=1)
-    return int(agreements(one, other, matches).sum(axis=1).max(initial=0))
+    best = agreements(one, other, matches[:MOST_ASKED]).sum(axis=1).argmax()
+    return int(agreeing_with(one, other, matches, int(best)).sum())
 
 
 class LargestFeatures:
@@ -132,11 +150,51 @@ def largest_features(flight: Flight) -> LargestFeatures | None:
     return LargestFeatures(flight) if flight.database.has_sift() else None
 
 
-def _least(at: NDArray[np.float32], codes: torch.Tensor) -> NDArray[np.int32]:
+def _by_word(halved: NDArray[np.int8]) -> tuple[NDArray[np.intp], tuple[slice, ...]]:
+    """Return (N,) the order of descriptors by their words; where each word's are then."""
+    words = _sift_words()
+    word = products(operand(halved), operand(words)).argmax(axis=1)
+    ends = np.cumsum(np.bincount(word, minlength=len(words))).tolist()
+    slices = tuple(slice(*ends_of) for ends_of in zip([0, *ends], ends, strict=False))
+    return np.argsort(word, kind="stable"), slices
+
+
+@cache
+def _sift_words() -> NDArray[np.int8]:
+    """Return (W, 128) bytes, all of about one length."""
+    with files(__package__).joinpath(WORDS_FILE).open("rb") as file:
+        words: NDArray[np.int8] = np.load(file)
+    return words
+
+
+def _most_alike(one: Largest, other: Largest) -> tuple[NDArray[np.intp], NDArray[np.int32]]:
+    """Return (N,) which feature of the other photo is the most alike of the same word; (N,) their
+    product, 0 where there is none."""
+    best = np.zeros(len(one.at), np.intp)
+    most = np.zeros(len(one.at), np.int32)
+    words = zip(one.words, one.codes, other.words, other.codes, strict=True)
+    for word, codes, other_word, other_codes in words:
+        if word.start < word.stop and other_word.start < other_word.stop:
+            alike = products(codes, other_codes)
+            nearest = alike.argmax(axis=1)
+            best[word] = other_word.start + nearest
+            most[word] = alike[np.arange(len(nearest)), nearest]
+    return best, most
+
+
+def _least(
+    at: NDArray[np.float32], words: Sequence[slice], codes: Sequence[torch.Tensor]
+) -> NDArray[np.int32]:
     """Return the product that a match of each feature must exceed."""
-    alike = products(codes, codes)
-    np.fill_diagonal(alike, 0)
-    i, j = cKDTree(at).query_pairs(SAME_PLACE, output_type="ndarray").T
-    alike[i, j] = alike[j, i] = 0
-    nearest = np.arccos(np.minimum(alike.max(axis=1, initial=0) / UNIT**2, 1))
+    most = np.zeros(len(at), np.float32)
+    same_place = cKDTree(at).query_pairs(SAME_PLACE, output_type="ndarray")
+    for word, codes_of_word in zip(words, codes, strict=True):
+        if word.start < word.stop:
+            alike = products(codes_of_word, codes_of_word)
+            np.fill_diagonal(alike, 0)
+            inside = ((same_place >= word.start) & (same_place < word.stop)).all(axis=1)
+            i, j = same_place[inside].T - word.start
+            alike[i, j] = alike[j, i] = 0
+            most[word] = alike.max(axis=1)
+    nearest = np.arccos(np.minimum(most / UNIT**2, 1))
     return np.ceil(UNIT**2 * np.cos(np.minimum(RATIO * nearest, MAX_ANGLE))).astype(np.int32)

@@ -1,8 +1,9 @@
 """Compare candidates place by place, and order them by what agrees.
 
 A global descriptor says that two photos show the same kind of ground. That they show the same
-piece of it is known when places that look alike also lie alike (`retrieval.places`). Where few
-places agree, the largest SIFT features are asked as well, if there are any (`retrieval.confirm`).
+piece of it is known when what looks alike also lies alike: the largest SIFT features of both
+(`retrieval.confirm`), or, where a photo has none, the cells behind the descriptors
+(`retrieval.places`).
 
 The counts spread by query expansion: the sure neighbours of my sure neighbours are likely mine.
 So they choose what is compared next, and a photo stops asking once its latest comparisons found
@@ -13,7 +14,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,38 +35,45 @@ from colmap_netvlad.retrieval.places import Places, agreeing_matches
 from colmap_netvlad.runtime.progress import step
 
 CHANCE = 10
-"""Matches that agree in photos of different ground as well: the median of six flights is 8 to 10
+"""Places that agree in photos of different ground as well: the median of six flights is 8 to 10
 where the overlap is small. They count as nothing."""
 
-PLENTY = 60
-"""So many matches leave no doubt: the features of such a pair are not asked, and taken to agree in
-as many."""
+SURE = 20
+"""More agreeing places than this make a sure partner."""
 
 FEATURES_BY_CHANCE = 2
-FEATURE_WEIGHT = 2.0
-"""Features that agree in photos of different ground as well, where each match agrees with itself;
-places that each beyond these counts for. What these three were chosen by: docs/training-log.md,
-section 17."""
+SURE_FEATURES = 7
+"""The same of features, where each match agrees with itself."""
+
+FEATURE_WEIGHT = 10.0
+"""What the square root of a number of features counts for, in places. They are many where photos
+overlap by far, and then few more of them say nothing."""
 
 EXPANSION_NEIGHBOURS = 12
 EXPANSION_SHARE = 0.4
-"""Query expansion. What these constants were chosen by: docs/training-log.md, section 9."""
+"""Query expansion. What these constants were chosen by: docs/training-log.md, sections 9 and 20."""
 
-ASK = 10
-"""Candidates that an image asks for at a time."""
 
-PATIENCE = 20
-FEATURES_PATIENCE = 10
-"""An image asks no more after so many candidates in a row that were no sure partners; the second
-number holds where features are asked as well, which tell weak partners."""
+@dataclass(frozen=True)
+class Asking:
+    """When an image stops asking for candidates.
 
-SURE = 10
-"""More matches beyond chance than this make a sure partner."""
+    Attributes:
+        at_a_time: candidates that it asks for.
+        patience: it stops after so many in a row that were no sure partners,
+        partners: unless it has fewer sure ones: what hardly overlaps with any other is not to be
+            missed.
+    """
 
-SURE_PARTNERS = 2
-FEATURES_SURE_PARTNERS = 3
-"""Who has fewer sure partners asks on: what hardly overlaps with any other is not to be missed.
-What these were chosen by: docs/training-log.md, sections 10 and 17."""
+    at_a_time: int
+    patience: int
+    partners: int
+
+
+BY_PLACES = Asking(at_a_time=10, patience=20, partners=2)
+BY_FEATURES = Asking(at_a_time=8, patience=8, partners=3)
+"""Features tell weak partners better. What these were chosen by: docs/training-log.md, sections 10
+and 20."""
 
 TAIL = 1e-3
 """Weight of the candidates' own order, which decides where nothing agrees."""
@@ -81,8 +89,8 @@ def rerank(
 ) -> Ranking:
     """Return a ranking as deep as the candidates', at most `depth` of them compared place by place.
 
-    Each image asks for its best candidates, `ASK` at a time, until some in a row were no sure
-    partners, or to the end where it has hardly any. What was learned so far chooses: a
+    Each image asks for its best candidates, a few at a time, until some in a row were no sure
+    partners, or to the end where it has hardly any (`Asking`). What was learned so far chooses: a
     neighbour whom the descriptors overlooked is found by way of its neighbours. Counts are kept
     in the store: pairs compared before are not compared again.
 
@@ -96,9 +104,8 @@ def rerank(
     counted = _Counted(store, model, candidates, features)
     own = TAIL * _own_order(candidates)
     similarity, seconds = own, 0.0
-    patience = PATIENCE if features is None else FEATURES_PATIENCE
-    partners = SURE_PARTNERS if features is None else FEATURES_SURE_PARTNERS
-    most = np.full(len(candidates.names), min(ASK, depth - depth // 2), np.intp)
+    asking = BY_PLACES if features is None else BY_FEATURES
+    most = np.full(len(candidates.names), min(asking.at_a_time, depth - depth // 2), np.intp)
     asks, left, quiet = most, np.full_like(most, depth), np.zeros_like(most)
     with step("Comparing photos place by place", len(asks)) as bar:
         while asks.any():
@@ -108,10 +115,10 @@ def rerank(
             agreement = counted.agreement()
             expanded = expand(agreement, EXPANSION_NEIGHBOURS, EXPANSION_SHARE, max(k, depth))
             similarity = (expanded + own).tocsr()
-            sure = agreement > SURE
+            sure = counted.sure()
             found = (chosen > 0).multiply(sure).sum(axis=1) > 0
             quiet = np.where(found, 0, quiet + asks)
-            goes_on = (quiet < patience) | (sure.sum(axis=1) < partners)
+            goes_on = (quiet < asking.patience) | (sure.sum(axis=1) < asking.partners)
             left = left - asks
             asked, asks = asks, np.where((asks > 0) & goes_on, np.minimum(most, left), 0)
             bar.advance(int(np.count_nonzero(asked) - np.count_nonzero(asks)))
@@ -158,25 +165,40 @@ class _Counted:
         )
         self._pairs = np.zeros((0, 2), np.intp)
         self._beyond = np.zeros(0)
+        self._sure = np.zeros(0, np.bool_)
 
     def compare(self, pairs: Pairs) -> float:
-        """Count what agrees in pairs that have cells; return the seconds it took, now or when they
-        were first compared."""
-        pairs = pairs[self._places.has(pairs)]
-        places, seconds = self._places.count(pairs)
-        beyond = np.maximum(places - CHANCE, 0.0)
-        if self._features is not None:
-            features, doubtful = places.copy(), places < PLENTY
-            features[doubtful], more = self._features.count(pairs[doubtful])
-            beyond += FEATURE_WEIGHT * np.maximum(features - FEATURES_BY_CHANCE, 0)
+        """Count what agrees in pairs, by features where both images have some, by cells where both
+        have those; return the seconds it took, now or when they were first compared."""
+        by_features = (
+            np.zeros(len(pairs), np.bool_) if self._features is None else self._features.has(pairs)
+        )
+        by_places = self._places.has(pairs) & ~by_features
+        seconds = 0.0
+        if self._features is not None and by_features.any():
+            count, seconds = self._features.count(pairs[by_features])
+            beyond = FEATURE_WEIGHT * np.sqrt(np.maximum(count - FEATURES_BY_CHANCE, 0))
+            self._add(pairs[by_features], beyond, count > SURE_FEATURES)
+        if by_places.any():
+            count, more = self._places.count(pairs[by_places])
+            self._add(pairs[by_places], np.maximum(count - CHANCE, 0.0), count > SURE)
             seconds += more
+        return seconds
+
+    def _add(self, pairs: Pairs, beyond: NDArray[np.float64], sure: NDArray[np.bool_]) -> None:
         self._pairs = np.concatenate([self._pairs, pairs])
         self._beyond = np.concatenate([self._beyond, beyond])
-        return seconds
+        self._sure = np.concatenate([self._sure, sure])
 
     def agreement(self) -> sparse.csr_array:
         """Return (N, N) symmetric: what agrees beyond chance, in places."""
         matrix = self._matrix(self._beyond)
+        matrix.eliminate_zeros()
+        return matrix
+
+    def sure(self) -> sparse.csr_array:
+        """Return (N, N) symmetric: 1 for sure partners."""
+        matrix = self._matrix(self._sure.astype(np.float64))
         matrix.eliminate_zeros()
         return matrix
 

@@ -52,7 +52,9 @@ def bytes_or_floats() -> torch.dtype:
 
     if not hasattr(torch, "_int_mm"):
         return torch.float32
-    return min((torch.int8, torch.float32), key=_seconds)
+    # In one thread: where others work, threads wait for each other, and chance decides.
+    with one_thread():
+        return min((torch.int8, torch.float32), key=_seconds)
 
 
 def _seconds(kind: torch.dtype) -> float:
