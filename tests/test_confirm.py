@@ -17,8 +17,8 @@ from colmap_netvlad.colmap.database import Database
 from colmap_netvlad.commands.pairs import make_pairs
 from colmap_netvlad.flight import open_flight
 from colmap_netvlad.project import Project
-from colmap_netvlad.retrieval import rerank as module
 from colmap_netvlad.retrieval.confirm import (
+    LARGE,
     LARGEST,
     LARGEST_FEATURES,
     MOST_ASKED,
@@ -28,7 +28,7 @@ from colmap_netvlad.retrieval.confirm import (
 )
 from colmap_netvlad.retrieval.options import RetrievalOptions
 from colmap_netvlad.retrieval.places import Places, agreeing_matches
-from colmap_netvlad.retrieval.rerank import FEATURES_BY_CHANCE, rerank
+from colmap_netvlad.retrieval.rerank import FEATURES_BY_CHANCE, PLENTY, rerank
 from colmap_netvlad.runtime import products
 
 MakeProject = Callable[..., Project]
@@ -80,6 +80,15 @@ def test_the_largest_features_lie_word_after_word() -> None:
     ends = [word.stop for word in photo.words]
     assert [0, *ends[:-1]] == [word.start for word in photo.words] and ends[-1] == LARGEST
     assert [len(codes) for codes in photo.codes] == [w.stop - w.start for w in photo.words]
+
+
+def test_small_features_count_a_half() -> None:
+    keypoints, descriptors = ground(0, LARGEST)
+    photo = Largest.of(keypoints, descriptors)
+    assert photo.large.sum() == LARGE
+    assert photo.log_scale[photo.large].min() >= photo.log_scale[~photo.large].max()
+    matched = agreeing_features(photo, photo)
+    assert matched == (LARGEST + LARGE) // 2
 
 
 def test_what_looks_alike_but_lies_elsewhere_does_not_agree() -> None:
@@ -188,18 +197,21 @@ def test_a_pair_that_places_do_not_tell_is_found_by_its_features(store: Store) -
     assert ranking.partners[0, 0] == 5 and ranking.partners[5, 0] == 0
 
 
-def test_photos_that_have_features_are_not_compared_by_their_places(
-    store: Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(module, "agreeing_matches", lambda *_: pytest.fail("compared"))
-    rerank(in_order(), store, "m", 5, features=Kept(of_one_ground("0.jpg", "5.jpg")))
+def test_where_places_leave_no_doubt_no_feature_is_read(tmp_path: Path) -> None:
+    cells = [Cells.of(np.random.default_rng(0).normal(size=(16, 12, 12)))] * 6
+    assert len(cells[0].places()) > PLENTY
+    kept = Kept(of_one_ground())
+    with Store(tmp_path / "project.netvlad.db") as store:
+        store.add_descriptors("m", NAMES, NAMES, np.zeros((6, 4), np.float32), 0, cells)
+        rerank(in_order(), store, "m", 5, features=kept)
+    assert kept.read_of == []
 
 
 def test_features_are_asked_once_and_again_where_they_changed(store: Store) -> None:
     kept = Kept(of_one_ground("0.jpg", "5.jpg"))
     first = rerank(in_order(), store, "m", 5, features=kept)
     assert set(kept.read_of) == set(NAMES)
-    assert len(kept.read_of) <= len(NAMES) + 1, "each once, the first once more to see its size"
+    assert len(kept.read_of) <= len(NAMES) + 3, "each once, three once more to see their size"
     again = Kept(of_one_ground("0.jpg", "5.jpg"))
     np.testing.assert_array_equal(
         rerank(in_order(), store, "m", 5, features=again).partners, first.partners

@@ -61,12 +61,12 @@ FITTED = {
         intercept=-2.08,
     ),
     True: Weights(
-        similarity=1.84,
-        agreeing=1.43,
-        failing=-5.53,
-        rate=-3.08,
-        support=0.816,
-        intercept=-7.39,
+        similarity=3.18,
+        agreeing=1.83,
+        failing=-4.51,
+        rate=-4.34,
+        support=0.46,
+        intercept=-10.09,
     ),
 }
 """By whether the ranking's candidates were compared place by place: such a ranking says more."""

@@ -28,11 +28,15 @@ from colmap_netvlad.runtime.products import operand, products
 if TYPE_CHECKING:
     import torch
 
-LARGEST_FEATURES = "2,000 largest SIFT features"
+LARGEST_FEATURES = "2,000 largest SIFT features, 800 of them twice"
 """What the store numbers them under: counts of other features have other numbers."""
 
 LARGEST = 2000
 """Features of a photo, those of the largest scales, which photos of other heights show too."""
+
+LARGE = 800
+"""Of these, the larger ones: a match of two of them counts twice as much as another. Small features
+tell weak overlaps, and they are the ones that a car has like every other car of its make."""
 
 WORDS_FILE = "sift_words.npy"
 """(W, 128) int8, mean directions of SIFT descriptors (`scripts/make_sift_words.py`)."""
@@ -64,6 +68,7 @@ class Largest:
         at: (N, 2) x, y, pixels.
         log_scale: (N,) natural logarithm of the scale.
         angle: (N,) orientation, rad.
+        large: (N,) whether it is one of the `LARGE` largest.
         words: where each word's features are, of W words.
         codes: (n, 128) halved descriptors of each word.
         least: (N,) the product of halved descriptors that a match must exceed.
@@ -72,6 +77,7 @@ class Largest:
     at: NDArray[np.float32]
     log_scale: NDArray[np.float32]
     angle: NDArray[np.float32]
+    large: NDArray[np.bool_]
     words: tuple[slice, ...]
     codes: tuple[torch.Tensor, ...]
     least: NDArray[np.int32]
@@ -79,7 +85,7 @@ class Largest:
     @property
     def nbytes(self) -> int:
         """Memory they take."""
-        arrays = (self.at, self.log_scale, self.angle, self.least)
+        arrays = (self.at, self.log_scale, self.angle, self.large, self.least)
         return sum(a.nbytes for a in arrays) + sum(codes.nbytes for codes in self.codes)
 
     @classmethod
@@ -87,16 +93,17 @@ class Largest:
         """Choose from features as COLMAP's database keeps them."""
         scale = scales(keypoints)
         order = np.flatnonzero(usable(keypoints, scale))
-        if len(order) > LARGEST:
-            order = np.sort(order[np.argpartition(-scale[order], LARGEST)[:LARGEST]])
+        order = order[np.argsort(-scale[order], kind="stable")][:LARGEST]
+        large = np.arange(len(order)) < LARGE
         halved = HALVED[descriptors[order]]
         by_word, words = _by_word(halved)
-        order, halved = order[by_word], halved[by_word]
+        order, large, halved = order[by_word], large[by_word], halved[by_word]
         at, codes = keypoints[order, :2], tuple(operand(halved[word]) for word in words)
         return cls(
             at,
             np.log(scale[order]).astype(np.float32),
             angles(keypoints[order]).astype(np.float32),
+            large,
             words,
             codes,
             _least(at, words, codes),
@@ -105,7 +112,7 @@ class Largest:
 
 def agreeing_features(one: Largest, other: Largest) -> int:
     """Return how many matches agree with one of the most alike, itself included: the one that most
-    of these agree with."""
+    of these agree with. Matches of large features count one, others a half."""
     if min(len(one.at), len(other.at)) == 0:
         return 0
     j, alike = _most_alike(one, other)
@@ -117,7 +124,8 @@ def agreeing_features(one: Largest, other: Largest) -> int:
     i = i[np.sort(np.unique(j[i], return_index=True)[1])]
     matches = np.stack([i, j[i]], axis=1)
     best = agreements(one, other, matches[:MOST_ASKED]).sum(axis=1).argmax()
-    return int(agreeing_with(one, other, matches, int(best)).sum())
+    i, j = matches[agreeing_with(one, other, matches, int(best))].T
+    return (len(i) + int(np.count_nonzero(one.large[i] & other.large[j])) + 1) // 2
 
 
 class LargestFeatures:

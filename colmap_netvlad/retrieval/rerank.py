@@ -1,9 +1,8 @@
 """Compare candidates place by place, and order them by what agrees.
 
 A global descriptor says that two photos show the same kind of ground. That they show the same
-piece of it is known when what looks alike also lies alike: the largest SIFT features of both
-(`retrieval.confirm`), or, where a photo has none, the cells behind the descriptors
-(`retrieval.places`).
+piece of it is known when places that look alike also lie alike (`retrieval.places`). Where few
+places agree, the largest SIFT features are asked as well, if there are any (`retrieval.confirm`).
 
 The counts spread by query expansion: the sure neighbours of my sure neighbours are likely mine.
 So they choose what is compared next, and a photo stops asking once its latest comparisons found
@@ -46,8 +45,14 @@ SURE_FEATURES = 7
 """The same of features, where each match agrees with itself."""
 
 FEATURE_WEIGHT = 10.0
-"""What the square root of a number of features counts for, in places. They are many where photos
-overlap by far, and then few more of them say nothing."""
+PLACE_WEIGHT = 0.25
+"""What the square root of a number of features counts for, and beside it a place. Features are many
+where photos overlap by far, and then some more of them say nothing."""
+
+PLENTY = 60
+PLENTY_OF_FEATURES = 2
+"""So many places leave no doubt: the features of such a pair are not asked, and taken to be so many
+times as many."""
 
 EXPANSION_NEIGHBOURS = 12
 EXPANSION_SHARE = 0.4
@@ -71,7 +76,7 @@ class Asking:
 
 
 BY_PLACES = Asking(at_a_time=10, patience=20, partners=2)
-BY_FEATURES = Asking(at_a_time=8, patience=8, partners=3)
+BY_FEATURES = Asking(at_a_time=10, patience=10, partners=3)
 """Features tell weak partners better. What these were chosen by: docs/training-log.md, sections 10
 and 20."""
 
@@ -124,7 +129,8 @@ def rerank(
             bar.advance(int(np.count_nonzero(asked) - np.count_nonzero(asks)))
             seconds += time.perf_counter() - start
     # Logarithms: twice the matches are not twice as likely to be a true pair.
-    best = ranking_of(similarity.log1p(), candidates.names, candidates.method, candidates.depth)
+    scores = (similarity / CHANCE).log1p()
+    best = ranking_of(scores, candidates.names, candidates.method, candidates.depth)
     return replace(
         candidates,
         partners=best.partners,
@@ -168,21 +174,20 @@ class _Counted:
         self._sure = np.zeros(0, np.bool_)
 
     def compare(self, pairs: Pairs) -> float:
-        """Count what agrees in pairs, by features where both images have some, by cells where both
-        have those; return the seconds it took, now or when they were first compared."""
-        by_features = (
-            np.zeros(len(pairs), np.bool_) if self._features is None else self._features.has(pairs)
-        )
-        by_places = self._places.has(pairs) & ~by_features
-        seconds = 0.0
-        if self._features is not None and by_features.any():
-            count, seconds = self._features.count(pairs[by_features])
-            beyond = FEATURE_WEIGHT * np.sqrt(np.maximum(count - FEATURES_BY_CHANCE, 0))
-            self._add(pairs[by_features], beyond, count > SURE_FEATURES)
-        if by_places.any():
-            count, more = self._places.count(pairs[by_places])
-            self._add(pairs[by_places], np.maximum(count - CHANCE, 0.0), count > SURE)
+        """Count what agrees in pairs that have cells; return the seconds it took, now or when they
+        were first compared."""
+        pairs = pairs[self._places.has(pairs)]
+        places, seconds = self._places.count(pairs)
+        beyond, sure = np.maximum(places - CHANCE, 0.0), places > SURE
+        if self._features is not None:
+            asked = self._features.has(pairs)
+            features, doubtful = PLENTY_OF_FEATURES * places, asked & (places < PLENTY)
+            features[doubtful], more = self._features.count(pairs[doubtful])
+            seen = FEATURE_WEIGHT * np.sqrt(np.maximum(features - FEATURES_BY_CHANCE, 0))
+            beyond = np.where(asked, PLACE_WEIGHT * beyond + seen, beyond)
+            sure = np.where(asked, features > SURE_FEATURES, sure)
             seconds += more
+        self._add(pairs, beyond, sure)
         return seconds
 
     def _add(self, pairs: Pairs, beyond: NDArray[np.float64], sure: NDArray[np.bool_]) -> None:
