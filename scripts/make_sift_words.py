@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_netvlad.colmap.database import open_database
-from colmap_netvlad.graph.oriented import scales, usable
+from colmap_netvlad.graph.oriented import largest_first, scales, usable
 from colmap_netvlad.retrieval.confirm import LARGEST
 from colmap_netvlad.runtime.files import write_atomically
 from colmap_netvlad.terminal import Command
@@ -61,8 +61,8 @@ def draw(file: Path, count: int, generator: np.random.Generator) -> NDArray[np.u
     with open_database(file) as database:
         for image_id in sorted(database.images_with_features()):
             keypoints = database.keypoint_shapes(image_id)
-            scale = np.where(usable(keypoints, scales(keypoints)), scales(keypoints), 0)
-            chosen = np.argsort(-scale, kind="stable")[:LARGEST]
+            scale = scales(keypoints)
+            chosen = largest_first(scale, usable(keypoints, scale))[:LARGEST]
             largest.append(database.sift_descriptors(image_id)[chosen])
     together = np.concatenate(largest)
     return together[generator.permutation(len(together))[:count]]

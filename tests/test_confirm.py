@@ -1,4 +1,4 @@
-"""The largest SIFT features tell which photos show the same ground, and are asked once."""
+"""The largest SIFT features confirm pairs of which few places agree, and are asked once."""
 
 from __future__ import annotations
 
@@ -151,6 +151,24 @@ def test_machines_that_multiply_floats_faster_find_the_same(
             )
         )
     assert counts[0] == counts[1]
+
+
+def test_bytes_or_floats_are_tried_in_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Several wait for each other where other work runs, and chance would decide."""
+    threads = []
+
+    def tried(kind: torch.dtype) -> float:
+        threads.append(torch.get_num_threads())
+        return 0.0
+
+    monkeypatch.setattr(products, "_seconds", tried)
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        products.bytes_or_floats.__wrapped__()
+        assert set(threads) == {1} and torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
 
 
 class Kept:

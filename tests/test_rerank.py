@@ -220,7 +220,7 @@ def test_who_finds_nothing_more_stops_asking(compared_in_a_circle) -> None:
     assert ranking.partners.shape == (CIRCLE, CIRCLE - 1), "the others follow in their own order"
 
 
-def test_where_there_are_features_who_finds_nothing_more_stops_sooner(
+def test_where_features_are_asked_as_well_who_finds_nothing_more_stops_sooner(
     compared_in_a_circle,
 ) -> None:
     after = {

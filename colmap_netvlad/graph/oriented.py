@@ -60,8 +60,8 @@ def agreeing_with(
     agree = _alike(one, other, matches[place : place + 1], matches)[0]
     others = np.flatnonzero(agree)
     this = np.full_like(others, place)
-    agree[others] = predicted(one, other, matches, this, others)
-    agree[others] &= predicted(one, other, matches, others, this)
+    ends = np.concatenate([this, others]), np.concatenate([others, this])
+    agree[others] = predicted(one, other, matches, *ends).reshape(2, -1).all(axis=0)
     return agree
 
 
@@ -119,6 +119,12 @@ def usable(keypoints: NDArray[np.float32], scale: NDArray[np.float64]) -> NDArra
     """Return (N,) which of such keypoints are whole: all of it finite, and the scale positive."""
     whole: NDArray[np.bool_] = np.isfinite(keypoints).all(axis=1) & (scale > 0)
     return whole
+
+
+def largest_first(scale: NDArray[np.float64], whole: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Return which keypoints are whole, those of the largest scales first, equal ones in order."""
+    order = np.flatnonzero(whole)
+    return order[np.argsort(-scale[order], kind="stable")]
 
 
 def angles(keypoints: NDArray[np.float32]) -> NDArray[np.float64]:

@@ -12,7 +12,7 @@ from zlib import crc32
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_netvlad.graph.oriented import angles, scales, usable
+from colmap_netvlad.graph.oriented import angles, largest_first, scales, usable
 from colmap_netvlad.matching.nearest import Codes
 
 SIFT_BYTES = 128
@@ -73,14 +73,13 @@ def prepare(keypoints: NDArray[np.float32], descriptors: NDArray[np.uint8]) -> S
     at = np.where(good[:, None], keypoints[:, :2], np.nan).astype(np.float32)
     if not good.all():
         descriptors = np.where(good[:, None], descriptors, np.uint8(0))
-    order = np.argsort(-np.where(good, scale, 0), kind="stable")[: good.sum()]
     blocks = tuple(_blocks(at, np.flatnonzero(good)))
     return SiftFeatures(
         at=at,
         log_scale=np.log(np.where(good, scale, 1)).astype(np.float32),
         angle=np.where(good, angle, 0).astype(np.float32),
         codes=Codes.of(descriptors),
-        largest=order,
+        largest=largest_first(scale, good),
         blocks=blocks,
         centres=np.array([at[block].mean(axis=0, dtype=float) for block in blocks]).reshape(-1, 2),
         corners=_corners(at[good]),

@@ -22,14 +22,18 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from colmap_netvlad.flight import Flight
-from colmap_netvlad.graph.oriented import agreeing_with, agreements, angles, scales, usable
+from colmap_netvlad.graph.oriented import (
+    agreeing_with,
+    agreements,
+    angles,
+    largest_first,
+    scales,
+    usable,
+)
 from colmap_netvlad.runtime.products import operand, products
 
 if TYPE_CHECKING:
     import torch
-
-LARGEST_FEATURES = "2,000 largest SIFT features, 800 of them twice"
-"""What the store numbers them under: counts of other features have other numbers."""
 
 LARGEST = 2000
 """Features of a photo, those of the largest scales, which photos of other heights show too."""
@@ -37,6 +41,9 @@ LARGEST = 2000
 LARGE = 800
 """Of these, the larger ones: a match of two of them counts twice as much as another. Small features
 tell weak overlaps, and they are the ones that a car has like every other car of its make."""
+
+LARGEST_FEATURES = f"{LARGEST:,} largest SIFT features, {LARGE} of them twice"
+"""What the store numbers them under: counts of other features have other numbers."""
 
 WORDS_FILE = "sift_words.npy"
 """(W, 128) int8, mean directions of SIFT descriptors (`scripts/make_sift_words.py`)."""
@@ -92,8 +99,7 @@ class Largest:
     def of(cls, keypoints: NDArray[np.float32], descriptors: NDArray[np.uint8]) -> Largest:
         """Choose from features as COLMAP's database keeps them."""
         scale = scales(keypoints)
-        order = np.flatnonzero(usable(keypoints, scale))
-        order = order[np.argsort(-scale[order], kind="stable")][:LARGEST]
+        order = largest_first(scale, usable(keypoints, scale))[:LARGEST]
         large = np.arange(len(order)) < LARGE
         halved = HALVED[descriptors[order]]
         by_word, words = _by_word(halved)

@@ -78,7 +78,7 @@ class Asking:
 BY_PLACES = Asking(at_a_time=10, patience=20, partners=2)
 BY_FEATURES = Asking(at_a_time=10, patience=10, partners=3)
 """Features tell weak partners better. What these were chosen by: docs/training-log.md, sections 10
-and 20."""
+and 17."""
 
 TAIL = 1e-3
 """Weight of the candidates' own order, which decides where nothing agrees."""
@@ -187,25 +187,18 @@ class _Counted:
             beyond = np.where(asked, PLACE_WEIGHT * beyond + seen, beyond)
             sure = np.where(asked, features > SURE_FEATURES, sure)
             seconds += more
-        self._add(pairs, beyond, sure)
-        return seconds
-
-    def _add(self, pairs: Pairs, beyond: NDArray[np.float64], sure: NDArray[np.bool_]) -> None:
         self._pairs = np.concatenate([self._pairs, pairs])
         self._beyond = np.concatenate([self._beyond, beyond])
         self._sure = np.concatenate([self._sure, sure])
+        return seconds
 
     def agreement(self) -> sparse.csr_array:
         """Return (N, N) symmetric: what agrees beyond chance, in places."""
-        matrix = self._matrix(self._beyond)
-        matrix.eliminate_zeros()
-        return matrix
+        return self._matrix(self._beyond)
 
     def sure(self) -> sparse.csr_array:
         """Return (N, N) symmetric: 1 for sure partners."""
-        matrix = self._matrix(self._sure.astype(np.float64))
-        matrix.eliminate_zeros()
-        return matrix
+        return self._matrix(self._sure.astype(np.float64))
 
     def without(self, similarity: sparse.csr_array) -> sparse.csr_array:
         """Return a similarity without the pairs compared so far."""
@@ -217,7 +210,9 @@ class _Counted:
     def _matrix(self, values: NDArray[np.float64]) -> sparse.csr_array:
         n = len(self._places.numbers)
         upper = sparse.csr_array((values, tuple(self._pairs.T)), shape=(n, n))
-        return (upper + upper.T).tocsr()
+        matrix = (upper + upper.T).tocsr()
+        matrix.eliminate_zeros()
+        return matrix
 
 
 def _counts_of_places(
