@@ -52,6 +52,10 @@ def sift(values: NDArray[np.floating]) -> NDArray[np.uint8]:
     return np.round(values).clip(0, 255).astype(np.uint8)
 
 
+def agreeing(one: Largest, other: Largest) -> int:
+    return agreeing_features(one, [other])[0]
+
+
 def seen(features: Features, turn: float, scaling: float, shift: float) -> Features:
     """The same features in a photo that is turned, scaled and shifted."""
     keypoints, descriptors = features
@@ -65,12 +69,12 @@ def seen(features: Features, turn: float, scaling: float, shift: float) -> Featu
 def test_all_features_of_one_ground_agree_however_it_was_seen(turn: float, scaling: float) -> None:
     one = ground(0)
     other = seen(one, turn, scaling, 80)
-    assert agreeing_features(Largest.of(*one), Largest.of(*other)) == 200 > MOST_ASKED
+    assert agreeing(Largest.of(*one), Largest.of(*other)) == 200 > MOST_ASKED
 
 
 def test_features_of_different_ground_agree_by_chance_only() -> None:
     photos = [Largest.of(*ground(seed)) for seed in range(6)]
-    counts = [agreeing_features(one, other) for one in photos for other in photos if one != other]
+    counts = [agreeing(one, other) for one in photos for other in photos if one != other]
     assert max(counts) <= FEATURES_BY_CHANCE
 
 
@@ -87,14 +91,14 @@ def test_small_features_count_a_half() -> None:
     photo = Largest.of(keypoints, descriptors)
     assert photo.large.sum() == LARGE
     assert photo.log_scale[photo.large].min() >= photo.log_scale[~photo.large].max()
-    matched = agreeing_features(photo, photo)
+    matched = agreeing(photo, photo)
     assert matched == (LARGEST + LARGE) // 2
 
 
 def test_what_looks_alike_but_lies_elsewhere_does_not_agree() -> None:
     keypoints, descriptors = ground(0)
     elsewhere = ground(1)[0], descriptors
-    assert agreeing_features(Largest.of(keypoints, descriptors), Largest.of(*elsewhere)) <= 5
+    assert agreeing(Largest.of(keypoints, descriptors), Largest.of(*elsewhere)) <= 5
 
 
 def test_what_a_photo_shows_over_and_over_confirms_nothing() -> None:
@@ -104,7 +108,7 @@ def test_what_a_photo_shows_over_and_over_confirms_nothing() -> None:
     palms = sift(descriptors[:1] + rng.uniform(0, 12, descriptors.shape))
     photo = Largest.of(keypoints, palms)
     other = sift(descriptors[:1] + rng.uniform(0, 12, descriptors.shape))
-    assert agreeing_features(photo, Largest.of(keypoints, other)) <= FEATURES_BY_CHANCE
+    assert agreeing(photo, Largest.of(keypoints, other)) <= FEATURES_BY_CHANCE
 
 
 def test_one_place_seen_in_two_ways_still_confirms() -> None:
@@ -112,7 +116,7 @@ def test_one_place_seen_in_two_ways_still_confirms() -> None:
     keypoints, descriptors = ground(0)
     twice = np.concatenate([keypoints, keypoints + np.float32([0.5, 0, 0, 0.2])])
     photo = Largest.of(twice, np.concatenate([descriptors, descriptors]))
-    assert agreeing_features(photo, photo) == 200
+    assert agreeing(photo, photo) == 200
 
 
 @pytest.mark.parametrize("columns", [2, 4, 6])
@@ -122,16 +126,16 @@ def test_keypoints_of_every_form_are_read(columns: int) -> None:
     shape = np.stack([np.cos(angle), -np.sin(angle), np.sin(angle), np.cos(angle)], axis=1)
     whole = np.column_stack([keypoints[:, :2], shape * scale[:, None]]).astype(np.float32)
     photo = Largest.of({2: keypoints[:, :2], 4: keypoints, 6: whole}[columns], descriptors)
-    assert agreeing_features(photo, photo) == 30
+    assert agreeing(photo, photo) == 30
 
 
 def test_keypoints_that_are_not_finite_and_photos_without_features_confirm_nothing() -> None:
     keypoints, descriptors = ground(0, 40)
     keypoints[:30] = np.nan
     photo = Largest.of(keypoints, descriptors)
-    assert len(photo.at) == agreeing_features(photo, photo) == 10
+    assert len(photo.at) == agreeing(photo, photo) == 10
     none = Largest.of(keypoints[:0], descriptors[:0])
-    assert agreeing_features(photo, none) == agreeing_features(none, photo) == 0
+    assert agreeing(photo, none) == agreeing(none, photo) == 0
 
 
 def test_machines_that_multiply_floats_faster_find_the_same(
@@ -145,7 +149,7 @@ def test_machines_that_multiply_floats_faster_find_the_same(
         places = [Places.of(grid) for grid in cells]
         counts.append(
             (
-                agreeing_features(Largest.of(*one), Largest.of(*other)),
+                agreeing(Largest.of(*one), Largest.of(*other)),
                 agreeing_matches(places[0], places[1]),
                 agreeing_matches(places[0], places[2]),
             )

@@ -9,7 +9,8 @@ before it may each have their own.
 
 from __future__ import annotations
 
-from typing import Protocol
+from dataclasses import dataclass, fields
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,34 +46,59 @@ class Oriented(Protocol):
     def angle(self) -> NDArray[np.float32]: ...
 
 
+@dataclass(frozen=True, eq=False)
+class Motions:
+    """What matches say of how one photo lies in the other, each by itself.
+
+    Attributes:
+        scaling: natural logarithm.
+        cos, sin: of the turn.
+        start, end: the places matched, x + iy, pixels.
+    """
+
+    scaling: NDArray[np.float32]
+    cos: NDArray[np.float32]
+    sin: NDArray[np.float32]
+    start: NDArray[np.complex64]
+    end: NDArray[np.complex64]
+
+    @classmethod
+    def of(cls, one: Oriented, other: Oriented, matches: Matches) -> Motions:
+        """Return (M,) the motions of matches."""
+        i, j = matches.T
+        turn = other.angle[j] - one.angle[i]
+        return cls(
+            other.log_scale[j] - one.log_scale[i],
+            np.cos(turn),
+            np.sin(turn),
+            _complex(one.at[i]),
+            _complex(other.at[j]),
+        )
+
+    def __getitem__(self, index: Any) -> Motions:
+        return Motions(*(getattr(self, field.name)[index] for field in fields(self)))
+
+    def alike(self, other: Motions) -> NDArray[np.bool_]:
+        """Return whether both turn and scale alike; shapes are broadcast."""
+        near: NDArray[np.bool_] = np.abs(self.scaling - other.scaling) < SCALING
+        return near & (self.cos * other.cos + self.sin * other.sin > np.cos(TURN))
+
+    def predict(self, other: Motions) -> NDArray[np.bool_]:
+        """Return whether the others end where these predict; shapes are broadcast."""
+        similarity = np.exp(self.scaling) * (self.cos + np.complex64(1j) * self.sin)
+        moved = other.end - self.end
+        off = np.abs(similarity * (other.start - self.start) - moved)
+        near: NDArray[np.bool_] = np.less(off, SHIFT + STRETCH * np.abs(moved))
+        return near
+
+
 def agreements(one: Oriented, other: Oriented, matches: Matches) -> NDArray[np.bool_]:
     """Return (M, M) whether two matches each lie where the other predicts; of itself, True."""
-    alike = _alike(one, other, matches, matches)
-    rows, columns = np.nonzero(alike)
-    alike[rows, columns] = predicted(one, other, matches, rows, columns)
-    return alike & alike.T
-
-
-def agreeing_with(
-    one: Oriented, other: Oriented, matches: Matches, place: int
-) -> NDArray[np.bool_]:
-    """Return (M,) that row of `agreements`."""
-    agree = _alike(one, other, matches[place : place + 1], matches)[0]
-    others = np.flatnonzero(agree)
-    this = np.full_like(others, place)
-    ends = np.concatenate([this, others]), np.concatenate([others, this])
-    agree[others] = predicted(one, other, matches, *ends).reshape(2, -1).all(axis=0)
-    return agree
-
-
-def _alike(one: Oriented, other: Oriented, matches: Matches, others: Matches) -> NDArray[np.bool_]:
-    """Return (M, N) whether matches are turned and scaled alike."""
-    turn, scaling = _turn_and_scaling(one, other, matches)
-    turn_of_others, scaling_of_others = _turn_and_scaling(one, other, others)
-    alike = np.outer(np.cos(turn), np.cos(turn_of_others))
-    alike += np.outer(np.sin(turn), np.sin(turn_of_others))
-    near: NDArray[np.bool_] = np.abs(scaling[:, None] - scaling_of_others) < SCALING
-    return near & (alike > np.cos(TURN))
+    motions = Motions.of(one, other, matches)
+    agree = motions[:, None].alike(motions[None])
+    rows, columns = np.nonzero(agree)
+    agree[rows, columns] = motions[rows].predict(motions[columns])
+    return agree & agree.T
 
 
 def predicted(
@@ -83,21 +109,8 @@ def predicted(
     columns: NDArray[np.intp],
 ) -> NDArray[np.bool_]:
     """Return whether the matches `columns` lie where the matches `rows` predict."""
-    i, j = matches.T
-    turn, scaling = _turn_and_scaling(one, other, matches)
-    similarity = np.exp(scaling + 1j * turn).astype(np.complex64)
-    from_place, to_place = _complex(one.at[i]), _complex(other.at[j])
-    moved = to_place[columns] - to_place[rows]
-    off = np.abs(similarity[rows] * (from_place[columns] - from_place[rows]) - moved)
-    near: NDArray[np.bool_] = np.less(off, SHIFT + STRETCH * np.abs(moved))
-    return near
-
-
-def _turn_and_scaling(
-    one: Oriented, other: Oriented, matches: Matches
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    i, j = matches.T
-    return other.angle[j] - one.angle[i], other.log_scale[j] - one.log_scale[i]
+    motions = Motions.of(one, other, matches)
+    return motions[rows].predict(motions[columns])
 
 
 def _complex(at: NDArray[np.float32]) -> NDArray[np.complex64]:

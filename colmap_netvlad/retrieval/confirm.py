@@ -23,8 +23,8 @@ from scipy.spatial import cKDTree
 
 from colmap_netvlad.flight import Flight
 from colmap_netvlad.graph.oriented import (
-    agreeing_with,
-    agreements,
+    Matches,
+    Motions,
     angles,
     largest_first,
     scales,
@@ -116,22 +116,67 @@ class Largest:
         )
 
 
-def agreeing_features(one: Largest, other: Largest) -> int:
-    """Return how many matches agree with one of the most alike, itself included: the one that most
-    of these agree with. Matches of large features count one, others a half."""
-    if min(len(one.at), len(other.at)) == 0:
-        return 0
-    j, alike = _most_alike(one, other)
-    i = np.flatnonzero((alike > one.least) & (alike > other.least[j]))
-    if not len(i):
-        return 0
-    # The most alike first; each feature of the other photo once.
-    i = i[np.argsort(-alike[i], kind="stable")]
-    i = i[np.sort(np.unique(j[i], return_index=True)[1])]
-    matches = np.stack([i, j[i]], axis=1)
-    best = agreements(one, other, matches[:MOST_ASKED]).sum(axis=1).argmax()
-    i, j = matches[agreeing_with(one, other, matches, int(best))].T
-    return (len(i) + int(np.count_nonzero(one.large[i] & other.large[j])) + 1) // 2
+def agreeing_features(one: Largest, others: Sequence[Largest]) -> list[int]:
+    """Return how many matches of a photo with each of several agree with one of the most alike,
+    itself included: the one that most of these agree with.
+
+    Matches of large features count one, others a half. Several at once, as a pair is little work
+    beside what it takes to ask for it.
+    """
+    several = _Several.of(others)
+    matches, pair = _matches(one, several)
+    if not len(pair):
+        return [0] * len(others)
+    motions = Motions.of(several, one, matches)
+    # The most alike of each pair, one row a pair, asked whether they agree with each other.
+    count = np.bincount(pair, minlength=len(others))
+    first = np.cumsum(count) - count
+    asked = np.minimum(count, MOST_ASKED)[:, None]
+    places = np.arange(MOST_ASKED)
+    table = first[:, None] + np.minimum(places, np.maximum(asked - 1, 0))
+    table = np.minimum(table, len(pair) - 1)
+    rows, columns = motions[table[:, :, None]], motions[table[:, None]]
+    there = (places[:, None] < asked[:, None]) & (places < asked[:, None])
+    agree = there & rows.alike(columns) & rows.predict(columns) & columns.predict(rows)
+    best = motions[(first + agree.sum(axis=2).argmax(axis=1))[pair]]
+    agree_with_best = motions.alike(best) & motions.predict(best) & best.predict(motions)
+    i, j = matches.T
+    halves = agree_with_best * (1 + (several.large[i] & one.large[j]))
+    counted: list[int] = ((np.bincount(pair, halves, len(others)).astype(int) + 1) // 2).tolist()
+    return counted
+
+
+@dataclass(frozen=True, eq=False)
+class _Several:
+    """The features of several photos, photo after photo: attributes as of `Largest`.
+
+    Attributes:
+        ends: (n,) where each photo's features end.
+    """
+
+    photos: Sequence[Largest]
+    ends: NDArray[np.intp]
+    at: NDArray[np.float32]
+    log_scale: NDArray[np.float32]
+    angle: NDArray[np.float32]
+    large: NDArray[np.bool_]
+    least: NDArray[np.int32]
+
+    @classmethod
+    def of(cls, photos: Sequence[Largest]) -> _Several:
+        names = ("at", "log_scale", "angle", "large", "least")
+        joined = {name: np.concatenate([getattr(p, name) for p in photos]) for name in names}
+        return cls(photos, np.cumsum([len(p.at) for p in photos]), **joined)
+
+    def in_word(self, number: int) -> tuple[NDArray[np.intp], list[torch.Tensor]]:
+        """Return (M,) where the features of a word are, and their codes photo by photo."""
+        starts = self.ends - [len(photo.at) for photo in self.photos]
+        words = [photo.words[number] for photo in self.photos]
+        where = [
+            np.arange(start + word.start, start + word.stop)
+            for start, word in zip(starts.tolist(), words, strict=True)
+        ]
+        return np.concatenate(where), [photo.codes[number] for photo in self.photos]
 
 
 class LargestFeatures:
@@ -181,18 +226,35 @@ def _sift_words() -> NDArray[np.int8]:
     return words
 
 
-def _most_alike(one: Largest, other: Largest) -> tuple[NDArray[np.intp], NDArray[np.int32]]:
-    """Return (N,) which feature of the other photo is the most alike of the same word; (N,) their
+def _matches(one: Largest, several: _Several) -> tuple[Matches, NDArray[np.intp]]:
+    """Return (M, 2) matches from the features of several photos to those of one, photo by photo,
+    the most alike first; (M,) which photo it is."""
+    best, most = _most_alike(one, several)
+    found = np.flatnonzero(most > several.least)
+    found = found[most[found] > one.least[best[found]]]
+    pair = np.searchsorted(several.ends, found, side="right")
+    order = np.lexsort((-most[found], pair))
+    found, pair = found[order], pair[order]
+    # Each feature of the one photo once a pair.
+    once = pair * len(one.at) + best[found]
+    keep = np.sort(np.unique(once, return_index=True)[1])
+    return np.stack([found[keep], best[found[keep]]], axis=1), pair[keep]
+
+
+def _most_alike(one: Largest, several: _Several) -> tuple[NDArray[np.intp], NDArray[np.int32]]:
+    """Return (N,) which feature of the one photo is the most alike of the same word; (N,) their
     product, 0 where there is none."""
-    best = np.zeros(len(one.at), np.intp)
-    most = np.zeros(len(one.at), np.int32)
-    words = zip(one.words, one.codes, other.words, other.codes, strict=True)
-    for word, codes, other_word, other_codes in words:
-        if word.start < word.stop and other_word.start < other_word.stop:
-            alike = products(codes, other_codes)
+    import torch
+
+    best = np.zeros(len(several.at), np.intp)
+    most = np.zeros(len(several.at), np.int32)
+    for number, word in enumerate(one.words):
+        where, codes = several.in_word(number)
+        if word.start < word.stop and len(where):
+            alike = products(torch.cat(codes), one.codes[number])
             nearest = alike.argmax(axis=1)
-            best[word] = other_word.start + nearest
-            most[word] = alike[np.arange(len(nearest)), nearest]
+            best[where] = word.start + nearest
+            most[where] = alike[np.arange(len(nearest)), nearest]
     return best, most
 
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cached_property, lru_cache
 from typing import Generic, Protocol, TypeVar
 
@@ -14,10 +16,14 @@ from colmap_netvlad.cache.store import Store
 from colmap_netvlad.runtime.machine import usable_memory, usable_processors
 from colmap_netvlad.runtime.products import threads_of_their_own
 from colmap_netvlad.runtime.progress import step
+from colmap_netvlad.runtime.sequences import blocks
 
 CACHE_SHARE = 1 / 8
 """Of the memory, for features of one kind: an image's are not read anew for each pair. Those of
 the largest features of 3,500 photos take 1 GiB."""
+
+AT_ONCE = 8
+"""Images that one is compared with at a time."""
 
 KEEP_PAIRS = 2000
 """Pairs compared between two writes to the store."""
@@ -36,6 +42,8 @@ class Seen(Protocol):
 
 
 Kind = TypeVar("Kind", bound=Seen)
+
+Agreeing = Callable[[Kind, Sequence[Kind]], list[int]]
 
 Known = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]
 """What the store has counted (`Store.agreements`)."""
@@ -57,14 +65,14 @@ class Counts(Generic[Kind]):
         known: Known,
         numbers: NDArray[np.int64],
         read: Callable[[int], Kind],
-        agreeing: Callable[[Kind, Kind], int],
+        agreeing: Agreeing[Kind],
     ) -> None:
         """Start from what the store has.
 
         Args:
             known: of all kinds of features; theirs are told apart by their numbers.
             read: an image's features, by its index.
-            agreeing: how much agrees in two images.
+            agreeing: how much agrees in an image and each of several others.
         """
         self.numbers = numbers
         self._store, self._read, self._agreeing = store, read, agreeing
@@ -124,23 +132,21 @@ def _compare(
     numbers: NDArray[np.int64],
     store: Store,
     read: Callable[[int], Kind],
-    agreeing: Callable[[Kind, Kind], int],
+    agreeing: Agreeing[Kind],
 ) -> Rows:
     """Count what agrees in pairs, ordered by their first image, into the store; return it."""
-    starts = np.flatnonzero(np.diff(pairs[:, 0], prepend=-1))
     rows: Rows = []
     kept = 0
     with (
         step("Pairs of candidates", len(pairs)) as bar,
-        # A pair is too little work to share: a thread for each of several pairs is twice as fast.
+        # Too little work to share: threads each of which compares on its own are twice as fast.
         threads_of_their_own(usable_processors()) as pool,
     ):
-        for group in np.split(pairs, starts[1:]):
-            start = time.perf_counter()
-            one = read(int(group[0, 0]))
-            others = [read(int(j)) for j in group[:, 1]]
-            counts = list(pool.map(lambda other, one=one: agreeing(one, other), others))
-            share = (time.perf_counter() - start) / len(group)
+        start = time.perf_counter()
+        for group, counts in _counted(_groups(pairs), read, agreeing, pool):
+            done = time.perf_counter()
+            share = (done - start) / len(group)
+            start = done
             for (i, j), count in zip(numbers[group].tolist(), counts, strict=True):
                 rows.append((min(i, j), max(i, j), count, share))
             if len(rows) - kept >= KEEP_PAIRS:
@@ -149,3 +155,30 @@ def _compare(
             bar.advance(len(group))
     store.add_agreements(rows[kept:])
     return rows
+
+
+def _groups(pairs: Pairs) -> Iterator[Pairs]:
+    """Yield pairs of the same first image, a few at a time."""
+    starts = np.flatnonzero(np.diff(pairs[:, 0], prepend=-1))
+    for group in np.split(pairs, starts[1:]):
+        for part in blocks(len(group), AT_ONCE):
+            yield group[part]
+
+
+def _counted(
+    groups: Iterable[Pairs],
+    read: Callable[[int], Kind],
+    agreeing: Agreeing[Kind],
+    pool: ThreadPoolExecutor,
+) -> Iterator[tuple[Pairs, list[int]]]:
+    """Yield groups and what agrees in each of their pairs, in order; features are read here."""
+    ahead = 2 * usable_processors()
+    waiting: deque[tuple[Pairs, Future[list[int]]]] = deque()
+    for group in groups:
+        one, others = read(int(group[0, 0])), [read(int(j)) for j in group[:, 1]]
+        waiting.append((group, pool.submit(agreeing, one, others)))
+        if len(waiting) > ahead:
+            oldest, counts = waiting.popleft()
+            yield oldest, counts.result()
+    for group, counts in waiting:
+        yield group, counts.result()

@@ -224,7 +224,7 @@ def _counts_of_places(
         known,
         numbers,
         lambda i: Places.of(store.read_cells(int(numbers[i]))),
-        agreeing_matches,
+        lambda one, others: [agreeing_matches(one, other) for other in others],
     )
 
 
