@@ -1,16 +1,16 @@
-"""Choose the weights of `hybrid` and of GPS nearness on exhaustively matched training flights.
+"""Choose VLAD's share in `hybrid` and the weight of GPS nearness on matched training flights.
 
     python scripts/fit_hybrid.py SCENE.db:PHOTOS [SCENE.db:PHOTOS ...]
 
-Prints the mean average precision of every combination's candidates (nothing is compared place by
-place), per flight and on the mean, the best one first. Flights without GPS count in the first table
-only. Databases are only read; descriptors are kept in a cache beside them.
+The truth is exhaustive matching. Prints the mean average precision of every setting's candidates
+(nothing is compared place by place), per flight and on the mean, the best one first. Flights
+without GPS count in the first table only. Databases are only read; descriptors are kept in a
+cache beside them.
 """
 
 from __future__ import annotations
 
 import argparse
-from itertools import product
 
 from fit_rounds import read_scene
 
@@ -23,20 +23,12 @@ from colmap_netvlad.models.catalogue import DEFAULT
 from colmap_netvlad.photos.positions import Positions
 from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval import gps
-from colmap_netvlad.retrieval.fusion import expand, fuse, ranking_of
+from colmap_netvlad.retrieval.methods import hybrid
 from colmap_netvlad.retrieval.options import RetrievalOptions
 from colmap_netvlad.retrieval.rank import rank_project
 
-DEEP = (0.3, 0.5, 0.7, 1.0, 1.5, 2.0)
-NEIGHBOURS = (5, 8, 12)
-SHARES = (0.3, 0.5)
+SHARES = (0.1, 0.25, 0.5, 1.0)
 NEARNESS = (1.0, 2.0, 4.0, 6.0, 8.0)
-
-
-def fused(rankings: list[Ranking], deep: float, neighbours: int, share: float) -> Ranking:
-    names = rankings[0].names
-    similarity = expand(fuse(rankings, [deep, 1.0]), neighbours, share, len(names))
-    return ranking_of(similarity, names, "hybrid", len(names) - 1)
 
 
 def main() -> None:
@@ -46,32 +38,29 @@ def main() -> None:
     arguments = parser.parse_args()
     projects = [read_scene(scene) for scene in arguments.scenes]
     truths = [correct_pairs(verified_by_name(project.database)) for project in projects]
-    rankings = [_both(project, arguments.model) for project in projects]
     header = " | ".join(project.database.stem for project in projects)
 
     print(f"| method | mean | {header} |\n|---|---|{'---|' * len(projects)}")
-    for place, name in enumerate(("deep", "vlad")):
-        _row(
-            name,
-            [
-                100 * mean_average_precision(r[place], t)
-                for r, t in zip(rankings, truths, strict=True)
-            ],
-        )
-    results = []
-    for setting in product(DEEP, NEIGHBOURS, SHARES):
-        scores = [
-            100 * mean_average_precision(fused(both, *setting), truth)
-            for both, truth in zip(rankings, truths, strict=True)
-        ]
-        results.append((sum(scores) / len(scores), setting, scores))
-    results.sort(reverse=True)
-    for _, setting, scores in results[:8]:
-        _row("deep {} x, {} neighbours, share {}".format(*setting), scores)
 
-    best = results[0][1]
-    where = [(p, both, t) for p, both, t in zip(projects, rankings, truths, strict=True)]
-    known = [(_positions(p), fused(both, *best), t) for p, both, t in where]
+    def scores_of(rankings: list[Ranking]) -> list[float]:
+        both = zip(rankings, truths, strict=True)
+        return [100 * mean_average_precision(ranking, truth) for ranking, truth in both]
+
+    for name in (arguments.model, "vlad"):
+        _row(name, scores_of([_ranking(project, name) for project in projects]))
+    results = []
+    for share in SHARES:
+        hybrid.VLAD_SHARE = share
+        rankings = [_ranking(project, "hybrid", arguments.model) for project in projects]
+        scores = scores_of(rankings)
+        results.append((sum(scores) / len(scores), share, scores, rankings))
+    results.sort(key=lambda result: -result[0])
+    for _, share, scores, _ in results:
+        _row(f"hybrid, VLAD x {share}", scores)
+
+    best = results[0][3]
+    where = zip(projects, best, truths, strict=True)
+    known = [(_positions(project), ranking, truth) for project, ranking, truth in where]
     known = [entry for entry in known if entry[0].useful]
     print(f"\nGPS nearness beside the best of them, {len(known)} flights with GPS:")
     for weight in NEARNESS:
@@ -80,9 +69,9 @@ def main() -> None:
         _row(f"weight {weight}", scores)
 
 
-def _both(project: Project, model: str) -> list[Ranking]:
-    options = RetrievalOptions(k=len(image_names(project.database)) - 1, gps="off", rerank=0)
-    return [rank_project(project, model, options), rank_project(project, "vlad", options)]
+def _ranking(project: Project, method: str, model: str | None = None) -> Ranking:
+    k = len(image_names(project.database)) - 1
+    return rank_project(project, method, RetrievalOptions(k=k, gps="off", rerank=0, model=model))
 
 
 def _positions(project: Project) -> Positions:

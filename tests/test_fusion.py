@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -10,7 +12,15 @@ from ranks import from_lists
 from scipy import sparse
 
 from colmap_netvlad.cache.ranking import NO_PARTNER, Ranking
-from colmap_netvlad.retrieval.fusion import expand, fuse, keep_best, ranking_of, similarity_matrix
+from colmap_netvlad.retrieval.fusion import (
+    USUAL,
+    above,
+    combine,
+    expand,
+    keep_best,
+    ranking_of,
+    similarity_matrix,
+)
 from colmap_netvlad.runtime.errors import InputError
 
 
@@ -54,19 +64,75 @@ def test_expansion_equals_its_definition_written_out(
     assert np.allclose(expand(similarity, neighbours, share, n).toarray(), expected)
 
 
+@given(seeds, st.integers(2, 12))
+@settings(max_examples=40, deadline=None)
+def test_what_is_above_the_usual_has_the_same_unit_in_all_lists(seed: int, n: int) -> None:
+    scores = np.random.default_rng(seed).normal(size=(n, n))
+    scores += scores.T
+    others = ~np.eye(n, dtype=bool)
+    expected = np.maximum(scores - scores[others].mean(), 0) / max(scores[others].std(), 1e-12)
+    np.fill_diagonal(expected, 0)
+    np.testing.assert_allclose(above(full_ranking(scores)).toarray(), expected, atol=1e-4)
+    moved = above(full_ranking(scores * 100 + 7)).toarray()
+    np.testing.assert_allclose(moved, expected, atol=1e-3)
+
+
+def test_an_image_without_neighbours_stays_without() -> None:
+    """Standardised row by row, it would be as sure of its nearest as any other image."""
+    scores = np.full((6, 6), 0.1)
+    scores[0, 1] = scores[1, 0] = scores[2, 3] = scores[3, 2] = 1.0
+    scores[4, 5] = scores[5, 4] = 0.11
+    similar = above(full_ranking(scores)).toarray()
+    assert similar[0, 1] > 1 and similar[4, 5] == 0
+    assert similarity_matrix(full_ranking(scores))[4, 5] > 0
+
+
+def test_the_best_partners_alone_tell_what_is_usual() -> None:
+    n = USUAL + 40
+    scores = np.where(np.arange(n) < USUAL, 1.0, -100.0) + np.eye(n)
+    lists = full_ranking(scores + scores.T)
+    cut = lists.top(USUAL)
+    np.testing.assert_allclose(above(lists).toarray(), above(cut).toarray())
+
+
 def test_two_weak_rankings_that_agree_beat_one_strong_voice() -> None:
     a, b = np.zeros((4, 4)), np.zeros((4, 4))
     a[0], b[0] = [0, 3, 2, 0], [0, 0, 2, 3]
     a[0, 3] = b[0, 1] = -3
-    fused = fuse([full_ranking(a + a.T), full_ranking(b + b.T)], [1.0, 1.0])
-    assert ranking_of(fused, tuple("wxyz"), "hybrid", 3).partners[0, 0] == 2
+    sources = [(full_ranking(scores + scores.T), 1.0) for scores in (a, b)]
+    assert combine(sources, "hybrid", 3).partners[0, 0] == 2
+
+
+def test_the_neighbours_of_neighbours_come_before_strangers() -> None:
+    """0 and 2 share nothing that their descriptors see, but both are surely neighbours of 1."""
+    scores = np.zeros((8, 8))
+    for i, j in ((0, 1), (1, 2), (4, 5), (6, 7)):
+        scores[i, j] = scores[j, i] = 1.0
+    scores[0, 2] = scores[2, 0] = -0.01
+    found = combine([(full_ranking(scores), 1.0)], "deep", 7)
+    assert set(found.partners[0, :2].tolist()) == {1, 2}
+    assert sorted(found.partners[0].tolist()) == [1, 2, 3, 4, 5, 6, 7], "nobody is lost"
+
+
+def test_images_that_one_ranking_has_are_in_the_sum() -> None:
+    names = ("a", "b", "c")
+    gone = np.array([[NO_PARTNER] * 2, [2, NO_PARTNER], [1, NO_PARTNER]], np.int32)
+    scores = np.where(gone == NO_PARTNER, -np.inf, 1.0).astype(np.float32)
+    without = Ranking(names, gone, scores, "deep", 1.0, 2.0, ("deep note",), (("a", "blurred"),))
+    whole = replace(full_ranking(np.ones((3, 3))), names=names, notes=("vlad note",))
+    both = combine([(without, 1.0), (whole, 0.5)], "hybrid", 2)
+    assert (both.partners != NO_PARTNER).all() and both.left_out == ()
+    assert both.notes == ("deep note", "vlad note")
+    assert both.seconds_describe == 1.0 and both.seconds_search > 2.0
+    alone = combine([(without, 1.0)], "deep", 2)
+    assert (alone.partners[0] == NO_PARTNER).all() and alone.left_out == without.left_out
 
 
 def test_rankings_of_different_images_are_refused_in_one_sentence() -> None:
     one = full_ranking(np.eye(3))
     other = full_ranking(np.eye(4), "vlad")
     with pytest.raises(InputError, match="different image sets"):
-        fuse([one, other], [1.0, 1.0])
+        combine([(one, 1.0), (other, 1.0)], "hybrid", 2)
 
 
 @given(seeds, st.integers(1, 12), st.integers(1, 12))

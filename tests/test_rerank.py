@@ -357,7 +357,7 @@ def test_what_was_counted_for_a_photo_that_changed_is_pruned(tmp_path: Path) -> 
 
 def test_deep_methods_compare_unless_told_not_to(project_copy, tiny_checkpoint: Path) -> None:
     project = project_copy()
-    plain = rank(project, tiny_checkpoint, RetrievalOptions(k=11, rerank=0))
+    plain = rank(project, tiny_checkpoint, RetrievalOptions(k=11, rerank=0, exact=True))
     with Store(project.cache) as store:
         assert store.agreements()[0].shape == (0, 2), "nothing is kept that is not asked for"
         assert plain.compared is False

@@ -144,7 +144,7 @@ def test_the_method_of_search_is_chosen_by_the_number_of_images(
 ) -> None:
     vectors = clustered(30, 8, 0)
     used = []
-    for name in ("_exact", "_reduced", "_hnsw"):
+    for name in ("nearest_by", "_reduced", "_hnsw"):
         real = getattr(search, name)
         monkeypatch.setattr(
             search, name, lambda *a, name=name, real=real: used.append(name) or real(*a)
@@ -154,7 +154,7 @@ def test_the_method_of_search_is_chosen_by_the_number_of_images(
     nearest(vectors, 3)
     nearest(vectors, 3, exact=True)
     nearest(vectors, 3, exact=False)
-    assert used == ["_exact", "_reduced", "_exact", "_hnsw"]
+    assert used == ["nearest_by", "_reduced", "nearest_by", "_hnsw"]
 
 
 def test_half_precision_and_a_single_image_are_served() -> None:

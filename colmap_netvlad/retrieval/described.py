@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from colmap_netvlad.cache.ranking import NO_PARTNER, Ranking
 from colmap_netvlad.cache.store import Store
 from colmap_netvlad.retrieval.options import RetrievalOptions
-from colmap_netvlad.retrieval.search import Vectors, nearest
+from colmap_netvlad.retrieval.search import Neighbours, Vectors, nearest
 
 
 def missing(store: Store, model: str, photos: Mapping[str, str], cells: bool = False) -> list[str]:
@@ -79,18 +79,25 @@ def rank_vectors(
         depth: partners of each image.
         method: name for the ranking.
     """
-    rows = np.array([i for i, name in enumerate(names) if name not in left_out], np.int32)
     start = time.perf_counter()
-    found, found_scores = nearest(vectors, depth, options.exact, options.seed)
-    partners = np.full((len(names), found.shape[1]), NO_PARTNER, np.int32)
+    found = nearest(vectors, depth, options.exact, options.seed)
+    ranking = rank_found(found, names, left_out, method)
+    return replace(ranking, seconds_search=time.perf_counter() - start)
+
+
+def rank_found(
+    found: Neighbours, names: Sequence[str], left_out: Mapping[str, str], method: str
+) -> Ranking:
+    """Return what was found for each described image as a ranking of all; see `rank_vectors`.
+
+    Args:
+        found: partners and scores of the names that are not in `left_out`, by their places
+            among these.
+    """
+    rows = np.array([i for i, name in enumerate(names) if name not in left_out], np.int32)
+    nearest_of_each, scores_of_each = found
+    partners = np.full((len(names), nearest_of_each.shape[1]), NO_PARTNER, np.int32)
     scores = np.full(partners.shape, -np.inf, np.float32)
-    partners[rows] = rows[found]
-    scores[rows] = found_scores
-    return Ranking(
-        tuple(names),
-        partners,
-        scores,
-        method,
-        seconds_search=time.perf_counter() - start,
-        left_out=tuple(left_out.items()),
-    )
+    partners[rows] = rows[nearest_of_each]
+    scores[rows] = scores_of_each
+    return Ranking(tuple(names), partners, scores, method, left_out=tuple(left_out.items()))

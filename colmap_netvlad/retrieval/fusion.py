@@ -7,7 +7,9 @@ dense matrix, so 20,000 images fit in memory.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +19,17 @@ from colmap_netvlad.cache.ranking import NO_PARTNER, Ranking
 from colmap_netvlad.graph.pair import places_by_name
 from colmap_netvlad.runtime.errors import InputError
 from colmap_netvlad.runtime.sequences import blocks
+
+USUAL = 80
+"""So many best partners of each image, or all others where they are fewer, tell what is usual."""
+
+EXPANSION_NEIGHBOURS = 8
+EXPANSION_SHARE = 0.6
+"""Query expansion of `combine`. What these constants were chosen by: docs/training-log.md, section
+21."""
+
+TAIL = 1e-3
+"""Weight of the rankings' own order in `combine`."""
 
 BLOCK_ROWS = 1024
 """Rows of a sparse product that are in memory at once."""
@@ -46,12 +59,37 @@ def similarity_matrix(ranking: Ranking) -> sparse.csr_array:
     return ((directed + directed.T) / 2).tocsr()
 
 
-def fuse(rankings: Sequence[Ranking], weights: Sequence[float]) -> sparse.csr_array:
-    """Return the weighted sum of the rankings' similarities, (N, N) symmetric and sparse.
+def above(ranking: Ranking) -> sparse.csr_array:
+    """Return the symmetric (N, N) sparse similarity of candidates above what is usual.
+
+    What is usual is the mean of all images' `USUAL` best scores; the unit is their standard
+    deviation. Unlike `similarity_matrix`'s, all lists have the same units: an image without
+    neighbours stays without.
+    """
+    n = len(ranking.names)
+    best = ranking.scores[:, :USUAL].astype(np.float64)
+    best = best[ranking.partners[:, :USUAL] != NO_PARTNER]
+    if not best.size:
+        return sparse.csr_array((n, n))
+    floor, unit = best.mean(), max(best.std(), 1e-12)
+    rows, places = np.nonzero((ranking.partners != NO_PARTNER) & (ranking.scores > floor))
+    over = (ranking.scores[rows, places] - floor) / unit
+    directed = sparse.csr_array((over, (rows, ranking.partners[rows, places])), shape=(n, n))
+    return directed.maximum(directed.T).tocsr()
+
+
+def combine(sources: Sequence[tuple[Ranking, float]], method: str, depth: int) -> Ranking:
+    """Return the ranking by several, each with its share.
+
+    How much more alike two images are than is usual (`above`) adds up, and the neighbours of an
+    image's best neighbours are likely its own (query expansion). Where nothing is above what is
+    usual, the rankings' own order decides.
 
     Raises:
         InputError: the rankings are of different image sets.
     """
+    start = time.perf_counter()
+    rankings = [ranking for ranking, _ in sources]
     names = rankings[0].names
     for ranking in rankings[1:]:
         if ranking.names != names:
@@ -60,10 +98,19 @@ def fuse(rankings: Sequence[Ranking], weights: Sequence[float]) -> sparse.csr_ar
                 f"{ranking.method} ({len(ranking.names)} images) are of different image sets; "
                 "make both from the same database."
             )
-    total = similarity_matrix(rankings[0]) * weights[0]
-    for ranking, weight in zip(rankings[1:], weights[1:], strict=True):
-        total = total + similarity_matrix(ranking) * weight
-    return total.tocsr()
+    similar = sum(share * above(ranking) for ranking, share in sources)
+    own_order = sum(share * similarity_matrix(ranking) for ranking, share in sources)
+    similarity = expand(similar.tocsr(), EXPANSION_NEIGHBOURS, EXPANSION_SHARE, depth)
+    unusable = set.intersection(*({name for name, _ in ranking.left_out} for ranking in rankings))
+    return replace(
+        ranking_of((similarity + TAIL * own_order).tocsr(), names, method, depth),
+        seconds_describe=sum(ranking.seconds_describe for ranking in rankings),
+        seconds_search=sum(ranking.seconds_search for ranking in rankings)
+        + time.perf_counter()
+        - start,
+        left_out=tuple((name, why) for name, why in rankings[0].left_out if name in unusable),
+        notes=tuple(note for ranking in rankings for note in ranking.notes),
+    )
 
 
 def expand(

@@ -50,6 +50,20 @@ class Vectors(Protocol):
     def __getitem__(self, rows: slice) -> NDArray[np.floating]: ...
 
 
+class Similar(Protocol):
+    """How alike `count` things are, each with each; the same in both directions."""
+
+    count: int
+
+    def parts(self) -> list[slice]:
+        """Return all rows, in parts to ask for at once."""
+        ...
+
+    def block(self, rows: slice, columns: slice) -> NDArray[np.float32]:
+        """Return how alike some are with others."""
+        ...
+
+
 Neighbours = tuple[NDArray[np.int32], NDArray[np.float32]]
 
 
@@ -72,32 +86,61 @@ def nearest(
         partners (N, k) int32 and scores (N, k) float32, the inner products (cosines), -1..1.
     """
     count = vectors.shape[0]
-    k = min(k, count - 1)
-    if k < 1:
-        return np.zeros((count, 0), np.int32), np.zeros((count, 0), np.float32)
+    k = max(min(k, count - 1), 0)
+    if k == 0:
+        return _nothing(count, k)
     if exact is False:
         return _hnsw(vectors, k, seed)
-    return _exact(vectors, k) if exact or count <= EXACT_UP_TO else _reduced(vectors, k)
+    if exact or count <= EXACT_UP_TO:
+        return nearest_by(_Cosines(vectors), k)
+    return _reduced(vectors, k)
 
 
-def _exact(vectors: Vectors | NDArray[np.floating], k: int) -> Neighbours:
-    count = vectors.shape[0]
-    partners = np.zeros((count, k), np.int32)
-    scores = np.full((count, k), -np.inf, np.float32)
-    parts = _blocks_of(vectors)
+def nearest_by(similar: Similar, k: int) -> Neighbours:
+    """Return for each row its `k` nearest other rows by exact search, as `nearest`.
+
+    Args:
+        similar: is asked once for each two parts of all rows.
+        k: partners of each row, clamped to N - 1.
+    """
+    partners, scores = _nothing(similar.count, max(min(k, similar.count - 1), 0))
+    if not scores.size:
+        return partners, scores
+    parts = similar.parts()
     with step("Searching neighbours", len(parts)) as bar:
         for i, rows in enumerate(parts):
-            left = _load(vectors, rows)
-            own = left @ left.T
+            own = similar.block(rows, rows)
             np.fill_diagonal(own, -np.inf)
             _merge(partners, scores, rows, own, rows)
             for columns in parts[i + 1 :]:
-                # One product serves both images of a pair.
-                product = left @ _load(vectors, columns).T
-                _merge(partners, scores, rows, product, columns)
-                _merge(partners, scores, columns, product.T, rows)
+                # One block serves both images of a pair.
+                block = similar.block(rows, columns)
+                _merge(partners, scores, rows, block, columns)
+                _merge(partners, scores, columns, block.T, rows)
             bar.advance()
     return partners, scores
+
+
+def _nothing(count: int, k: int) -> Neighbours:
+    return np.zeros((count, k), np.int32), np.full((count, k), -np.inf, np.float32)
+
+
+class _Cosines:
+    """The cosines of descriptors, which are read as they are asked for."""
+
+    def __init__(self, vectors: Vectors | NDArray[np.floating]) -> None:
+        self.count = vectors.shape[0]
+        self._vectors = vectors
+        self._latest: tuple[slice, NDArray[np.float32]] | None = None
+
+    def parts(self) -> list[slice]:
+        return _blocks_of(self._vectors)
+
+    def block(self, rows: slice, columns: slice) -> NDArray[np.float32]:
+        if self._latest is None or self._latest[0] != rows:
+            self._latest = rows, _load(self._vectors, rows)
+        left = self._latest[1]
+        return left @ (left if columns == rows else _load(self._vectors, columns)).T
 
 
 def _merge(

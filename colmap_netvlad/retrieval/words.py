@@ -20,22 +20,28 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from colmap_netvlad.cache.cells import Cells
-from colmap_netvlad.cache.codes import decode, encode
+from colmap_netvlad.cache.codes import encode
 from colmap_netvlad.cache.ranking import Ranking
 from colmap_netvlad.cache.store import Store
-from colmap_netvlad.retrieval.described import rank_vectors
-from colmap_netvlad.retrieval.fusion import expand, ranking_of, similarity_matrix
+from colmap_netvlad.retrieval.described import rank_described, rank_found
 from colmap_netvlad.retrieval.options import RetrievalOptions
-from colmap_netvlad.retrieval.search import EXACT_UP_TO, Vectors
+from colmap_netvlad.retrieval.search import EXACT_UP_TO, nearest_by
 from colmap_netvlad.runtime.machine import usable_processors
+from colmap_netvlad.runtime.products import operand, products
 from colmap_netvlad.runtime.progress import step
 from colmap_netvlad.runtime.sequences import blocks
 
 AXES = 32
 """Values of a cell here: its parts along the principal axes of the flight's cells."""
 
-MOST_WORDS = 1024
-"""A flight has a word a photo, up to this many: its descriptors are to fit in memory."""
+LEAST_WORDS = 256
+WORDS_A_PHOTO = 16
+"""A flight has a word a photo, but as many as this where its photos are few: at most so many for
+each of them."""
+
+MOST_WORDS = 2048
+MOST_BYTES = 640 << 20
+"""Its descriptors are to fit in memory: fewer words from 10,000 photos on."""
 
 SAMPLE = 100
 """Cells that a word is learned from."""
@@ -47,27 +53,32 @@ POWER = 0.35
 """A word's part of a descriptor gets this power of its length: many cells of one kind, a field or
 water, count little more than few, and what falls on a word by chance counts next to nothing."""
 
-MODELS_SHARE = 136
-"""With so many words the model's own descriptors count as much as theirs, and by the square less
-with more: in small flights words are single places, and say little of others."""
+RARITY = 5.0
+"""How alike cells of a photo must be to share a vote: each weighs 1 / (sum over all cells of
+exp(-5 (1 - cosine))), so that a wide field or water counts little more than a house (burstiness,
+Jegou et al., CVPR 2009)."""
 
-EXPANSION_NEIGHBOURS = 5
-EXPANSION_SHARE = 0.5
-"""Query expansion. What these constants were chosen by: docs/training-log.md, section 18."""
+MODELS_SHARE = 180
+LEAST_SHARE = 0.05
+"""With so many words the model's own descriptors count as much as theirs, and by the square less
+with more, to the point where they are left out: with few photos words are single places, and say
+little of others. What these constants were chosen by: docs/training-log.md, section 21."""
 
 BLOCK_PHOTOS = 64
+BLOCK_ROWS = 512
+"""Photos described, and rows multiplied, at once."""
 
 Read = Callable[[int], Cells]
 
 
 def serves(options: RetrievalOptions, photos: int) -> bool:
-    """Whether candidates are chosen by words of the flight's own.
+    """Whether photos are ranked by words of the flight's own, not by the model's descriptors.
 
-    Where all photos are compared with each other, there is nothing to choose; thousands of words
-    for tens of thousands of photos do not fit in memory.
+    They are, unless a kind of search is asked for, or each photo is compared with all others, so
+    that there is little to rank; above `search.EXACT_UP_TO` photos words do not fit in memory.
     """
-    many = 0 < options.rerank < photos - 1
-    return many and photos <= EXACT_UP_TO and options.exact is not False
+    all_compared = photos - 1 <= options.rerank
+    return options.exact is None and not all_compared and photos <= EXACT_UP_TO
 
 
 def rank_in_words(
@@ -79,12 +90,16 @@ def rank_in_words(
     depth: int,
     method: str,
     notes: Sequence[str] = (),
-) -> Ranking:
-    """Search the neighbours of all images by descriptors in words of their own.
+) -> list[tuple[Ranking, float]]:
+    """Rank the neighbours of all images by descriptors in words of their own.
 
     Args:
         store: holds the descriptors and cells of every name that is not in `left_out`; for the
             others see `described.rank_described`.
+
+    Returns:
+        That ranking and, where words are few, the one by the model's descriptors, each with its
+        share in `fusion.combine`.
     """
     start = time.perf_counter()
     described = [name for name in names if name not in left_out]
@@ -95,21 +110,21 @@ def rank_in_words(
         return store.read_cells(cells[photo])
 
     words = Words.learn(read, len(cells), options.seed)
-    share = models_share(len(words.centres))
-    codes = describe(words, read, len(cells))
-    vectors = InWords(codes, store.vectors(model, described), share)
-    found = rank_vectors(vectors, names, left_out, options, depth, method)
-    similarity = expand(
-        similarity_matrix(found), EXPANSION_NEIGHBOURS, EXPANSION_SHARE, found.depth
-    )
-    best = ranking_of(similarity, found.names, method, found.depth)
-    return replace(
-        best,
+    in_words = InWords(describe(words, read, len(cells)))
+    found = replace(
+        rank_found(nearest_by(in_words, depth), names, left_out, method),
         seconds_describe=store.seconds(model, described),
         seconds_search=time.perf_counter() - start,
-        left_out=found.left_out,
-        notes=(*notes, f"candidates by {len(words.centres):,} words of the flight's own"),
+        notes=(
+            *notes,
+            f"ranked by {len(words.centres):,} words of the flight's own",
+        ),
     )
+    share = models_share(len(words.centres))
+    if not share:
+        return [(found, 1.0)]
+    models = rank_described(store, model, names, left_out, options, depth, method)
+    return [(found, 1.0), (replace(models, seconds_describe=0.0), share)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +151,7 @@ class Words:
         """
         import faiss
 
-        count = min(photos, MOST_WORDS)
+        count = words_of(photos)
         sample = _sample(read, photos, SAMPLE * count, seed)
         axes = np.linalg.eigh((sample.T @ sample).astype(np.float64))[1][:, ::-1][:, :AXES]
         axes = np.ascontiguousarray(axes, np.float32)
@@ -158,44 +173,49 @@ class Words:
 
     def describe(self, cells: Cells) -> NDArray[np.int8]:
         """Return the descriptor of a photo, (K A,), as `cache.codes.encode` keeps it."""
-        x = _unit(_textured(cells) @ self.axes)
+        vectors = _textured(cells)
+        x = _unit(vectors @ self.axes)
         scores = self.hardness * (x @ _unit(self.centres).T)
         weights = np.exp(scores - scores.max(axis=1, keepdims=True))
-        weights /= weights.sum(axis=1, keepdims=True)
+        weights *= (_rarity(vectors) / weights.sum(axis=1))[:, None]
         residuals = weights.T @ x - weights.sum(axis=0)[:, None] * self.centres
         lengths = np.linalg.norm(residuals, axis=1, keepdims=True)
         return encode((residuals * np.maximum(lengths, 1e-9) ** (POWER - 1)).ravel())
 
 
 class InWords:
-    """(N, D) descriptors of a flight in its own words, beside those of the model: rows to slice.
+    """The cosines of N photos described in words of their flight's own.
 
     Attributes:
-        shape: (N, D).
+        count: N.
     """
 
-    def __init__(self, codes: NDArray[np.int8], models: Vectors, share: float) -> None:
-        """Join descriptors in words with the model's, which are read as they are sliced.
+    def __init__(self, codes: NDArray[np.int8]) -> None:
+        """Take (N, K A) descriptors of `describe`."""
+        self.count = len(codes)
+        self._codes = codes
+        self._scale = np.concatenate([_scale(codes[rows]) for rows in self.parts()])
 
-        Args:
-            codes: (N, K A) of `Words.describe`.
-            models: (N, D) L2-normalised.
-            share: weight of the model's cosines beside those in words; 0: they are left out.
-        """
-        self._codes, self._models = codes, models
-        self._weights = np.sqrt(np.array([1.0, share]) / (1.0 + share)).astype(np.float32)
-        self.shape = (len(codes), codes.shape[1] + (models.shape[1] if share else 0))
+    def parts(self) -> list[slice]:
+        """Return rows to multiply at once."""
+        return list(blocks(self.count, BLOCK_ROWS))
 
-    def __getitem__(self, rows: slice) -> NDArray[np.float32]:
-        own = self._weights[0] * decode(self._codes[rows])
-        if not self._weights[1]:
-            return own
-        return np.hstack([own, self._weights[1] * self._models[rows]])
+    def block(self, rows: slice, columns: slice) -> NDArray[np.float32]:
+        """Return the cosines of some photos with others."""
+        cosines = products(operand(self._codes[rows]), operand(self._codes[columns]))
+        return cosines * self._scale[rows, None] * self._scale[columns]
+
+
+def words_of(photos: int) -> int:
+    """Return how many words a flight gets."""
+    most = min(MOST_WORDS, MOST_BYTES // (AXES * photos))
+    return min(max(photos, min(LEAST_WORDS, WORDS_A_PHOTO * photos)), most)
 
 
 def models_share(words: int) -> float:
     """Return the weight of the model's cosines beside those in so many words."""
-    return (MODELS_SHARE / words) ** 2 if words < MOST_WORDS else 0.0
+    share = (MODELS_SHARE / words) ** 2
+    return share if share >= LEAST_SHARE else 0.0
 
 
 def describe(words: Words, read: Read, photos: int) -> NDArray[np.int8]:
@@ -215,13 +235,17 @@ def describe(words: Words, read: Read, photos: int) -> NDArray[np.int8]:
 
 
 def _sample(read: Read, photos: int, count: int, seed: int) -> NDArray[np.float32]:
-    """Return about `count` cells, as many of each photo."""
+    """Return about `count` cells, as many of each photo, rare ones rather than common ones."""
     generator = np.random.default_rng(seed)
     each = -(-count // photos)
     drawn = []
     for photo in range(photos):
         cells = _textured(read(photo))
-        drawn.append(cells[generator.permutation(len(cells))[:each]])
+        if len(cells) > each:
+            rarity = _rarity(cells)
+            shares = rarity / rarity.sum()
+            cells = cells[generator.choice(len(cells), each, replace=False, p=shares)]
+        drawn.append(cells)
     sample = np.concatenate(drawn)
     return sample if len(sample) else np.ones((1, sample.shape[1]), np.float32)
 
@@ -231,6 +255,20 @@ def _textured(cells: Cells) -> NDArray[np.float32]:
     return vectors[vectors.any(axis=1)]
 
 
+def _rarity(cells: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Return (P,) the weight of each of a photo's cells, at most 1: see `RARITY`."""
+    alike = np.exp(RARITY * (cells @ cells.T - 1))
+    rarity: NDArray[np.float64] = 1 / alike.sum(axis=1, dtype=np.float64)
+    return rarity
+
+
 def _unit(vectors: NDArray[np.float32]) -> NDArray[np.float32]:
     lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
     return vectors / np.maximum(lengths, 1e-12)
+
+
+def _scale(codes: NDArray[np.int8]) -> NDArray[np.float32]:
+    """Return (N,) what makes each row's length one."""
+    values = codes.astype(np.float32)
+    lengths = np.sqrt(np.einsum("ij,ij->i", values, values))
+    return np.reciprocal(np.maximum(lengths, 1e-12), dtype=np.float32)

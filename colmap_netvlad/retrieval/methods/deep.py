@@ -24,11 +24,13 @@ from colmap_netvlad.photos.decode import load_batches
 from colmap_netvlad.photos.folders import photo_folders
 from colmap_netvlad.photos.masks import find_mask
 from colmap_netvlad.retrieval.described import cache_note, missing, rank_described
+from colmap_netvlad.retrieval.fusion import combine
 from colmap_netvlad.retrieval.options import RetrievalOptions
 from colmap_netvlad.retrieval.words import rank_in_words, serves
 from colmap_netvlad.runtime import workers
 from colmap_netvlad.runtime.errors import InputError
 from colmap_netvlad.runtime.jobs import Enclosed, Load
+from colmap_netvlad.runtime.machine import usable_processors
 from colmap_netvlad.runtime.progress import step
 
 if TYPE_CHECKING:
@@ -38,25 +40,33 @@ BATCH_SIZE = 8
 
 
 def candidates(
-    flight: Flight, options: RetrievalOptions, depth: int, name_or_path: str | Path
+    flight: Flight,
+    options: RetrievalOptions,
+    depth: int,
+    name_or_path: str | Path,
+    beside: Sequence[tuple[Ranking, float]] = (),
 ) -> Ranking:
     """Rank by a model's descriptors; see `describe_photos`.
 
-    A flight of more photos than are compared with each is described in words of its own
-    (`retrieval.words`). Photos that cannot be used have no partners and are listed with a reason.
+    A flight is described in words of its own (`retrieval.words`) unless exact or approximate
+    search by the model's descriptors is asked for. Photos that cannot be used have no partners and
+    are listed with a reason.
 
     Args:
         flight: its photo folder must be known.
         name_or_path: a model of the catalogue, or a checkpoint file.
+        beside: other rankings and their shares (`fusion.combine`).
 
     Raises:
         InputError: no photo folder, no weights, not a checkpoint, or no photo that can be used.
     """
     key, left_out, note = describe_photos(flight, options, name_or_path)
     method = Path(name_or_path).stem if Path(name_or_path).suffix else str(name_or_path)
-    photos = len(flight.names) - len(left_out)
-    rank = rank_in_words if serves(options, photos) else rank_described
-    return rank(flight.store, key, flight.names, left_out, options, depth, method, [note])
+    known = flight.store, key, flight.names, left_out, options, depth, method, [note]
+    if serves(options, len(flight.names) - len(left_out)):
+        return combine([*rank_in_words(*known), *beside], method, depth)
+    alone = rank_described(*known)
+    return combine([(alone, 1.0), *beside], method, depth) if beside else alone
 
 
 def describe_photos(
@@ -64,7 +74,8 @@ def describe_photos(
 ) -> tuple[str, dict[str, str], str]:
     """Describe the photos that the store does not have yet, as they are on disk now.
 
-    Cells for `retrieval.rerank` are kept with the descriptors where `options.rerank` is not 0.
+    Cells for `retrieval.words` and `retrieval.rerank` are kept with the descriptors where either
+    will ask for them.
 
     Returns:
         What the store keeps them under; name -> reason of the photos that cannot be used; a
@@ -76,7 +87,7 @@ def describe_photos(
     folder, names = flight.project.need_images(), flight.names
     photos, left_out = _contents(flight.store, folder, names, options.masks)
     key = cells_key(name_or_path, options)
-    to_do = missing(flight.store, key, photos, cells=options.rerank > 0)
+    to_do = missing(flight.store, key, photos, cells=_needs_cells(options))
     bad = _describe(
         flight.store, key, checkpoint_file(name_or_path), folder, to_do, photos, options
     )
@@ -87,6 +98,10 @@ def describe_photos(
             f"{left_out[names[0]]}); mend `images`."
         )
     return key, left_out, cache_note(len(to_do) - len(bad), len(names) - len(left_out))
+
+
+def _needs_cells(options: RetrievalOptions) -> bool:
+    return options.rerank > 0 or options.exact is None
 
 
 def cells_key(name_or_path: str | Path, options: RetrievalOptions) -> str:
@@ -158,7 +173,7 @@ def _describe(
         names,
         load=Load(gpu=(options.device or "cuda").startswith("cuda")),
         folders=photo_folders(folder, options.masks),
-        first=options.batch_size or BATCH_SIZE,
+        first=_batch_size(options),
     )
     bad: dict[str, str] = {}
     start = time.perf_counter()
@@ -198,11 +213,16 @@ def _describe_share(
 ) -> Iterator[_Described]:
     """Describe photos batch by batch."""
     network = _network(checkpoint, options.device)
-    size = options.batch_size or BATCH_SIZE
+    size = _batch_size(options)
     for batch in load_batches(folder, names, network.long_side, size, masks=masks):
         vectors, maps = network.describe_with_cells(batch.pixels)
-        cells = [Cells.of(features) for features in maps] if options.rerank else []
+        cells = [Cells.of(features) for features in maps] if _needs_cells(options) else []
         yield _Described(batch.names, vectors, cells, batch.bad)
+
+
+def _batch_size(options: RetrievalOptions) -> int:
+    """Return how many photos are described at once: one for each processor at least."""
+    return options.batch_size or max(BATCH_SIZE, usable_processors())
 
 
 @lru_cache(maxsize=1)
