@@ -221,14 +221,15 @@ RETRIEVAL: tuple[Callable[[Any], Any], ...] = (
         default=COMPARED,
         show_default=True,
         help="Most candidates of each image that deep methods compare place by place; 0: none, the"
-        " global descriptors alone as in the paper.",
+        " descriptors alone (with --exact the model's as they are, as in the paper).",
     ),
     masks_option,
     click.option("--vocab-tree", type=FILE, help="Vocabulary tree of the method bow."),
     click.option(
         "--exact/--hnsw",
         default=None,
-        help="Force exact or approximate (HNSW) search.  [default: by the number of images]",
+        help="Search by the model's descriptors as they are, exactly or approximately (HNSW)."
+        "  [default: by descriptors in words of the flight's own]",
     ),
     device_option,
     seed_option,

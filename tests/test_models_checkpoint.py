@@ -135,6 +135,19 @@ def test_a_descriptor_does_not_depend_on_the_batch_it_is_in(checkpoint, photos):
     assert np.array_equal(together, alone)
 
 
+def test_nor_on_how_many_processors_there_are(checkpoint, photos, monkeypatch):
+    model = load_model(checkpoint, "cpu")
+    found = []
+    for processors in (1, 2, 5):
+        monkeypatch.setattr(describe, "usable_processors", lambda count=processors: count)
+        threads = torch.get_num_threads()
+        found.append(model.describe_with_cells(photos))
+        assert torch.get_num_threads() == threads, "others multiply in as many as before"
+    for descriptors, cells in found[1:]:
+        np.testing.assert_array_equal(descriptors, found[0][0])
+        np.testing.assert_array_equal(cells, found[0][1])
+
+
 def test_no_photos_make_no_descriptors(checkpoint):
     assert load_model(checkpoint, "cpu").describe(np.zeros((0, 3, 8, 8), np.uint8)).shape == (
         0,

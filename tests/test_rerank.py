@@ -277,6 +277,7 @@ def test_a_new_and_a_changed_photo_cost_their_own_pairs_only(store: Store, monke
 
 def test_a_run_that_was_stopped_goes_on_where_it_was(store: Store, monkeypatch) -> None:
     monkeypatch.setattr(counts, "KEEP_PAIRS", 1)
+    monkeypatch.setattr(counts, "usable_processors", lambda: 1)  # one thread: pairs in their order
     asked = []
 
     def stopped(one: Places, other: Places) -> int:

@@ -10,7 +10,7 @@ from typing import Any
 from colmap_netvlad.cache.ranking import Ranking
 from colmap_netvlad.flight import open_flight
 from colmap_netvlad.graph.components import component_names, components
-from colmap_netvlad.models.catalogue import CATALOGUE, DEFAULT
+from colmap_netvlad.models.catalogue import DEFAULT
 from colmap_netvlad.pairs.connect import apart_lines, connecting_budget, connecting_pairs
 from colmap_netvlad.pairs.lists import FORMATS, read_pairs, write_pairs
 from colmap_netvlad.pairs.rules import (
@@ -31,7 +31,7 @@ from colmap_netvlad.pairs.sessions import (
 from colmap_netvlad.pairs.union import ImagePair, union_of_top
 from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval.fusion import similarity_matrix
-from colmap_netvlad.retrieval.options import COMPARED, RetrievalOptions
+from colmap_netvlad.retrieval.options import RetrievalOptions
 from colmap_netvlad.retrieval.rank import export_descriptors, rank
 from colmap_netvlad.runtime.errors import InputError
 from colmap_netvlad.runtime.shell import command_line
@@ -55,7 +55,6 @@ class PairsReport:
         colmap_list: the list for COLMAP, where it cannot hold all pairs and so differs from
             `output`; else None.
         unwritable: image names that COLMAP's list cannot express.
-        has_features: whether the database has local features, which `hybrid` uses as well.
     """
 
     ranking: Ranking
@@ -64,7 +63,6 @@ class PairsReport:
     output: Path
     colmap_list: Path | None
     unwritable: list[str]
-    has_features: bool = False
     connecting: int = 0
     sessions: list[str] = field(default_factory=list)
 
@@ -120,7 +118,7 @@ def make_pairs(
             export_descriptors(flight, method, options, export)
         frames = [flight.frames.get(image.image_id) for image in flight.images]
         cameras = [image.camera_id for image in flight.images]
-        names, has_features = flight.names, bool(flight.descriptors)
+        names = flight.names
     ranking = without_same_frame(ranking, frames)
     depth = min(options.k, len(names) - 1)
     chosen = with_camera_quota(ranking, cameras, depth, rules.other_cameras)
@@ -141,7 +139,6 @@ def make_pairs(
         output,
         colmap_list,
         unwritable,
-        has_features,
         len(links),
         session_lines(sessions) if sessions else [],
     )
@@ -207,11 +204,6 @@ def summary(project: Project, report: PairsReport) -> list[str]:
             f"Warning      {report.colmap_list} lacks the pairs of {len(report.unwritable)} "
             f"images: COLMAP's list cannot hold names such as {report.unwritable[0]!r}; "
             f"{report.output.name} has all pairs, and the next command reads it."
-        )
-    if report.has_features and ranking.method in CATALOGUE and len(ranking.names) > COMPARED + 1:
-        lines.append(
-            "Better       The method hybrid looks for candidates by the database's SIFT features "
-            "too, and by GPS where there is any, for little time"
         )
     return [*lines, f"Next         {_next_command(project, report)}"]
 

@@ -53,12 +53,13 @@ class RetrievalOptions:
         seed: of every random choice.
         batch_size: photos described at once; None: the method's own.
         vocab_tree: the vocabulary tree of `bow`; None: see `bow.find_tree`.
-        exact: True or False forces exact search or HNSW; None: see `search.EXACT_UP_TO`.
+        exact: True or False forces exact search or HNSW by the model's descriptors as they are;
+            None: see `words.serves` and `search.EXACT_UP_TO`.
         masks: folder of masks in COLMAP's way: masked areas are neutral to deep descriptors.
         gps: whether positions re-weight the candidates, one of `GPS_MODES`; None: "auto" where
             candidates are compared place by place, which decides, else "off".
         rerank: most candidates of each image that deep methods compare place by place
-            (`retrieval.rerank`); 0: none, the global descriptors alone.
+            (`retrieval.rerank`); 0: none, the descriptors alone.
     """
 
     k: int = 30
