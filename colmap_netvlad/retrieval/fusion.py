@@ -103,7 +103,7 @@ def combine(sources: Sequence[tuple[Ranking, float]], method: str, depth: int) -
     similarity = expand(similar.tocsr(), EXPANSION_NEIGHBOURS, EXPANSION_SHARE, depth)
     unusable = set.intersection(*({name for name, _ in ranking.left_out} for ranking in rankings))
     return replace(
-        ranking_of((similarity + TAIL * own_order).tocsr(), names, method, depth),
+        ranking_of((similarity + TAIL * own_order).tocsr().sqrt(), names, method, depth),
         seconds_describe=sum(ranking.seconds_describe for ranking in rankings),
         seconds_search=sum(ranking.seconds_search for ranking in rankings)
         + time.perf_counter()
