@@ -131,13 +131,12 @@ def agreeing_features(one: Largest, others: Sequence[Largest]) -> list[int]:
     # The most alike of each pair, one row a pair, asked whether they agree with each other.
     count = np.bincount(pair, minlength=len(others))
     first = np.cumsum(count) - count
-    asked = np.minimum(count, MOST_ASKED)[:, None]
     places = np.arange(MOST_ASKED)
-    table = first[:, None] + np.minimum(places, np.maximum(asked - 1, 0))
-    table = np.minimum(table, len(pair) - 1)
-    rows, columns = motions[table[:, :, None]], motions[table[:, None]]
-    there = (places[:, None] < asked[:, None]) & (places < asked[:, None])
-    agree = there & rows.alike(columns) & rows.predict(columns) & columns.predict(rows)
+    asked = np.minimum(first[:, None] + places, len(pair) - 1)
+    there = places < count[:, None]
+    rows, columns = motions[asked[:, :, None]], motions[asked[:, None]]
+    agree = there[:, :, None] & there[:, None]
+    agree &= rows.alike(columns) & rows.predict(columns) & columns.predict(rows)
     best = motions[(first + agree.sum(axis=2).argmax(axis=1))[pair]]
     agree_with_best = motions.alike(best) & motions.predict(best) & best.predict(motions)
     i, j = matches.T

@@ -62,7 +62,7 @@ MODELS_SHARE = 180
 LEAST_SHARE = 0.05
 """With so many words the model's own descriptors count as much as theirs, and by the square less
 with more, to the point where they are left out: with few photos words are single places, and say
-little of others. What these constants were chosen by: docs/training-log.md, section 21."""
+little of others. What these constants were chosen by: docs/training-log.md, sections 18 and 21."""
 
 BLOCK_PHOTOS = 64
 BLOCK_ROWS = 512
@@ -115,10 +115,7 @@ def rank_in_words(
         rank_found(nearest_by(in_words, depth), names, left_out, method),
         seconds_describe=store.seconds(model, described),
         seconds_search=time.perf_counter() - start,
-        notes=(
-            *notes,
-            f"ranked by {len(words.centres):,} words of the flight's own",
-        ),
+        notes=(*notes, f"ranked by {len(words.centres):,} words of the flight's own"),
     )
     share = models_share(len(words.centres))
     if not share:
