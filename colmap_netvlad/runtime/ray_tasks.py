@@ -279,15 +279,15 @@ def _started(task: Any, reference: Any, call: Call, parcels: Parcels[Any]) -> di
 
 
 def _give_up(tasks: list[Any]) -> None:
-    """End tasks: they are asked to, so that they leave nothing on their machines' disks, then
-    killed."""
+    """End tasks: they are asked to, so that they leave nothing on their machines' disks; those that
+    do not are killed."""
     if not tasks:
         return
     with contextlib.suppress(Exception):
         for task in tasks:
             ray.cancel(task)
-        ray.wait(tasks, num_returns=len(tasks), timeout=CLEAR_SECONDS)
-        for task in tasks:
+        _, deaf = ray.wait(tasks, num_returns=len(tasks), timeout=CLEAR_SECONDS)
+        for task in deaf:
             ray.cancel(task, force=True)
 
 
