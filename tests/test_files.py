@@ -3,6 +3,8 @@
 import os
 import subprocess
 import sys
+import threading
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -117,3 +119,25 @@ def test_hints_are_quoted_for_the_shell_at_hand(monkeypatch: pytest.MonkeyPatch)
     assert command_line(words) == "colmap-netvlad pairs --db 'my flight.db'"
     monkeypatch.setattr(os, "name", "nt")
     assert command_line(words) == 'colmap-netvlad pairs --db "my flight.db"'
+
+
+def test_a_scratch_folder_goes_though_something_still_writes_there(tmp_path: Path) -> None:
+    """COLMAP's threads go on for a moment when their caller is interrupted."""
+    opened, left = threading.Event(), threading.Event()
+
+    def write(folder: Path) -> None:
+        for number in range(10_000):
+            if left.is_set() and number > 200:
+                return
+            with suppress(OSError):
+                folder.joinpath(str(number)).touch()
+            opened.set()
+
+    with pytest.raises(KeyboardInterrupt), scratch_folder(tmp_path) as folder:
+        writer = threading.Thread(target=write, args=(folder,))
+        writer.start()
+        opened.wait()
+        left.set()
+        raise KeyboardInterrupt
+    writer.join()
+    assert list(tmp_path.iterdir()) == []
