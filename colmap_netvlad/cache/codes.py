@@ -15,6 +15,11 @@ def encode(vectors: NDArray[np.floating]) -> NDArray[np.int8]:
 def decode(codes: NDArray[np.int8]) -> NDArray[np.float32]:
     """Return the vectors (M, D) of codes, L2-normalised; zeros stay zeros."""
     vectors = codes.astype(np.float32)
-    length = np.sqrt(np.einsum("ij,ij->i", vectors, vectors))
-    vectors /= np.maximum(length, 1e-12)[:, None]
+    vectors /= lengths(vectors)[:, None]
     return vectors
+
+
+def lengths(vectors: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return (M,) the lengths of vectors (M, D), none quite zero, to divide by."""
+    length: NDArray[np.float32] = np.sqrt(np.einsum("ij,ij->i", vectors, vectors))
+    return np.maximum(length, np.float32(1e-12))

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import shutil
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from colmap_netvlad.runtime.errors import InputError
-from colmap_netvlad.runtime.files import temporary_prefix
+from colmap_netvlad.runtime.files import remove_folder, temporary_prefix
 
 Finish = Callable[[Path], None]
 """What is done in a folder of new models before it gets its name: killed in between, there is no
@@ -44,7 +43,7 @@ def model_folder(output: Path) -> Iterator[Path]:
     except OSError as fault:
         raise InputError(f"Cannot write {output}: {fault.strerror or fault}.") from fault
     finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+        remove_folder(temporary)
 
 
 def numbered(folder: Path, before: str = "") -> list[Path]:

@@ -150,11 +150,11 @@ class _Several:
     """The features of several photos, photo after photo: attributes as of `Largest`.
 
     Attributes:
-        ends: (n,) where each photo's features end.
+        starts: (n,) where each photo's features begin.
     """
 
     photos: Sequence[Largest]
-    ends: NDArray[np.intp]
+    starts: NDArray[np.intp]
     at: NDArray[np.float32]
     log_scale: NDArray[np.float32]
     angle: NDArray[np.float32]
@@ -165,15 +165,15 @@ class _Several:
     def of(cls, photos: Sequence[Largest]) -> _Several:
         names = ("at", "log_scale", "angle", "large", "least")
         joined = {name: np.concatenate([getattr(p, name) for p in photos]) for name in names}
-        return cls(photos, np.cumsum([len(p.at) for p in photos]), **joined)
+        sizes = np.array([len(p.at) for p in photos])
+        return cls(photos, np.cumsum(sizes) - sizes, **joined)
 
     def in_word(self, number: int) -> tuple[NDArray[np.intp], list[torch.Tensor]]:
         """Return (M,) where the features of a word are, and their codes photo by photo."""
-        starts = self.ends - [len(photo.at) for photo in self.photos]
         words = [photo.words[number] for photo in self.photos]
         where = [
             np.arange(start + word.start, start + word.stop)
-            for start, word in zip(starts.tolist(), words, strict=True)
+            for start, word in zip(self.starts, words, strict=True)
         ]
         return np.concatenate(where), [photo.codes[number] for photo in self.photos]
 
@@ -231,7 +231,7 @@ def _matches(one: Largest, several: _Several) -> tuple[Matches, NDArray[np.intp]
     best, most = _most_alike(one, several)
     found = np.flatnonzero(most > several.least)
     found = found[most[found] > one.least[best[found]]]
-    pair = np.searchsorted(several.ends, found, side="right")
+    pair = np.searchsorted(several.starts, found, side="right") - 1
     order = np.lexsort((-most[found], pair))
     found, pair = found[order], pair[order]
     # Each feature of the one photo once a pair.

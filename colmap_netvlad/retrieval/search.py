@@ -86,14 +86,10 @@ def nearest(
         partners (N, k) int32 and scores (N, k) float32, the inner products (cosines), -1..1.
     """
     count = vectors.shape[0]
-    k = max(min(k, count - 1), 0)
-    if k == 0:
-        return _nothing(count, k)
-    if exact is False:
-        return _hnsw(vectors, k, seed)
-    if exact or count <= EXACT_UP_TO:
+    k = min(k, count - 1)
+    if exact or k < 1 or (exact is None and count <= EXACT_UP_TO):
         return nearest_by(_Cosines(vectors), k)
-    return _reduced(vectors, k)
+    return _hnsw(vectors, k, seed) if exact is False else _reduced(vectors, k)
 
 
 def nearest_by(similar: Similar, k: int) -> Neighbours:
@@ -103,8 +99,10 @@ def nearest_by(similar: Similar, k: int) -> Neighbours:
         similar: is asked once for each two parts of all rows.
         k: partners of each row, clamped to N - 1.
     """
-    partners, scores = _nothing(similar.count, max(min(k, similar.count - 1), 0))
-    if not scores.size:
+    k = max(min(k, similar.count - 1), 0)
+    partners = np.zeros((similar.count, k), np.int32)
+    scores = np.full((similar.count, k), -np.inf, np.float32)
+    if k == 0:
         return partners, scores
     parts = similar.parts()
     with step("Searching neighbours", len(parts)) as bar:
@@ -119,10 +117,6 @@ def nearest_by(similar: Similar, k: int) -> Neighbours:
                 _merge(partners, scores, columns, block.T, rows)
             bar.advance()
     return partners, scores
-
-
-def _nothing(count: int, k: int) -> Neighbours:
-    return np.zeros((count, k), np.int32), np.full((count, k), -np.inf, np.float32)
 
 
 class _Cosines:

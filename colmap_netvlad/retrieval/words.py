@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from colmap_netvlad.cache.cells import Cells
-from colmap_netvlad.cache.codes import encode
+from colmap_netvlad.cache.codes import encode, lengths
 from colmap_netvlad.cache.ranking import Ranking
 from colmap_netvlad.cache.store import Store
 from colmap_netvlad.retrieval.described import rank_described, rank_found
@@ -191,7 +191,8 @@ class InWords:
         """Take (N, K A) descriptors of `describe`."""
         self.count = len(codes)
         self._codes = codes
-        self._scale = np.concatenate([_scale(codes[rows]) for rows in self.parts()])
+        parts = (codes[rows].astype(np.float32) for rows in self.parts())
+        self._scale = np.reciprocal(np.concatenate([lengths(part) for part in parts]))
 
     def parts(self) -> list[slice]:
         """Return rows to multiply at once."""
@@ -262,10 +263,3 @@ def _rarity(cells: NDArray[np.float32]) -> NDArray[np.float64]:
 def _unit(vectors: NDArray[np.float32]) -> NDArray[np.float32]:
     lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
     return vectors / np.maximum(lengths, 1e-12)
-
-
-def _scale(codes: NDArray[np.int8]) -> NDArray[np.float32]:
-    """Return (N,) what makes each row's length one."""
-    values = codes.astype(np.float32)
-    lengths = np.sqrt(np.einsum("ij,ij->i", values, values))
-    return np.reciprocal(np.maximum(lengths, 1e-12), dtype=np.float32)

@@ -16,7 +16,7 @@ from pathlib import Path
 from colmap_netvlad.runtime.errors import InputError
 
 REMOVAL_PAUSES = (0.0, 0.05, 0.2, 0.5, 1.0)
-"""Before each try to remove a scratch folder, seconds."""
+"""Before each try to remove a folder, seconds."""
 
 
 @contextmanager
@@ -86,12 +86,12 @@ def scratch_folder(place: Path | None = None) -> Iterator[Path]:
     try:
         yield Path(folder)
     finally:
-        _remove_folder(Path(folder))
+        remove_folder(Path(folder))
 
 
-def _remove_folder(folder: Path) -> None:
-    """Remove a folder, in several tries: a thread of COLMAP's that an interrupted caller left at
-    work may write there a last time."""
+def remove_folder(folder: Path) -> None:
+    """Remove a folder of ours, in several tries: a thread of COLMAP's that an interrupted caller
+    left at work may write there a last time."""
     for pause in REMOVAL_PAUSES:
         time.sleep(pause)
         shutil.rmtree(folder, ignore_errors=True)
