@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,17 +18,10 @@ from colmap_netvlad.cache.store import Store
 from colmap_netvlad.cli import cli
 from colmap_netvlad.retrieval import counts
 from colmap_netvlad.retrieval import rerank as module
+from colmap_netvlad.retrieval.asking import AT_A_TIME, PARTNERS
 from colmap_netvlad.retrieval.options import COMPARED, RetrievalOptions
 from colmap_netvlad.retrieval.places import Places, agreeing_matches
-from colmap_netvlad.retrieval.rerank import (
-    BY_FEATURES,
-    BY_PLACES,
-    CHANCE,
-    SURE,
-    rerank,
-)
-
-ASK, PATIENCE = BY_PLACES.at_a_time, BY_PLACES.patience
+from colmap_netvlad.retrieval.rerank import CHANCE, SURE, rerank
 
 SIDE, STEP, PHOTOS = 12, 4, 9
 """A strip of ground seen by photos of SIDE x SIDE cells, each STEP cells after the one before."""
@@ -172,7 +164,6 @@ def compared_in_a_circle(tmp_path: Path, monkeypatch):
         agreeing: dict[tuple[int, int], int],
         otherwise: int = 0,
         depth: int = CIRCLE - 1,
-        features: SimpleNamespace | None = None,
     ):
         pairs = set()
 
@@ -190,7 +181,7 @@ def compared_in_a_circle(tmp_path: Path, monkeypatch):
         with Store(tmp_path / "circle.db") as store:
             store.add_descriptors("m", names, names, np.zeros((CIRCLE, 4)), 0, cells)
             candidates = Ranking(names, partners, scores, "circle")
-            ranking = rerank(candidates, store, "m", 5, depth, features)
+            ranking = rerank(candidates, store, "m", 5, depth)
         return pairs, ranking
 
     return run
@@ -202,49 +193,28 @@ def circle_pairs(image: int, places: range) -> set[tuple[int, int]]:
     return {(min(image, other), max(image, other)) for other in others}
 
 
-def asked_by_all(most: int) -> set[tuple[int, int]]:
-    return set().union(*(circle_pairs(i, range(1, most + 1)) for i in range(CIRCLE)))
-
-
 SURELY = SURE + 1
-NEXT_TO_EACH_OTHER = {
-    (min(pair), max(pair)): SURELY for pair in ((i, (i + 1) % CIRCLE) for i in range(CIRCLE))
+NEAR = {
+    (min(pair), max(pair)): SURELY
+    for apart in range(1, PARTNERS // 2 + 1)
+    for pair in ((i, (i + apart) % CIRCLE) for i in range(CIRCLE))
 }
-"""Each image has two sure partners: the one after it, its first candidate, and the one before."""
+"""Each image has as many sure partners as make it stop: those next to it on either side."""
 
 
 def test_who_finds_nothing_more_stops_asking(compared_in_a_circle) -> None:
-    pairs, ranking = compared_in_a_circle(NEXT_TO_EACH_OTHER)
-    assert pairs == asked_by_all(ASK + PATIENCE)
-    assert set(ranking.partners[7, :2]) == {6, 8}
+    pairs, ranking = compared_in_a_circle(NEAR)
+    assert pairs >= set(NEAR)
+    assert len(pairs) < CIRCLE * (CIRCLE - 1) // 3
+    assert set(ranking.partners[7, :PARTNERS]) == {4, 5, 6, 8, 9, 10}
     assert ranking.partners.shape == (CIRCLE, CIRCLE - 1), "the others follow in their own order"
-
-
-def test_where_features_are_asked_as_well_who_finds_nothing_more_stops_sooner(
-    compared_in_a_circle,
-) -> None:
-    after = {
-        (min(pair), max(pair)): SURELY
-        for apart in (1, 2)
-        for pair in ((i, (i + apart) % CIRCLE) for i in range(CIRCLE))
-    }
-    pairs, _ = compared_in_a_circle(after, features=SimpleNamespace(fingerprints={}))
-    assert pairs == asked_by_all(BY_FEATURES.at_a_time + BY_FEATURES.patience)
-
-
-def test_who_finds_a_sure_partner_late_goes_on_from_there(compared_in_a_circle) -> None:
-    partner = PATIENCE + 5  # among the last that image 0 would have asked for
-    pairs, ranking = compared_in_a_circle(NEXT_TO_EACH_OTHER | {(0, partner): 2 * SURELY})
-    assert pairs == asked_by_all(ASK + PATIENCE) | circle_pairs(0, range(1, ASK + 2 * PATIENCE + 1))
-    assert ranking.partners[0, 0] == partner
-    assert ranking.partners[partner, 0] == 0
 
 
 @pytest.mark.parametrize("matches", [0, SURELY - 1])
 def test_who_has_hardly_a_sure_partner_asks_to_the_end(compared_in_a_circle, matches: int) -> None:
-    alone = {pair: count for pair, count in NEXT_TO_EACH_OTHER.items() if 0 not in pair}
-    pairs, _ = compared_in_a_circle(alone | {(0, CIRCLE - 1): matches})
-    assert pairs >= circle_pairs(0, range(1, CIRCLE))
+    alone = {pair: count for pair, count in NEAR.items() if 7 not in pair}
+    pairs, _ = compared_in_a_circle(alone | {(6, 7): matches})
+    assert pairs >= circle_pairs(7, range(1, CIRCLE))
     assert len(pairs) < CIRCLE * (CIRCLE - 1) // 2, "the others stopped"
 
 
@@ -254,8 +224,8 @@ def test_where_all_are_partners_all_candidates_are_compared(compared_in_a_circle
 
 
 def test_no_image_asks_for_more_than_the_depth(compared_in_a_circle) -> None:
-    pairs, _ = compared_in_a_circle({}, otherwise=SURELY, depth=ASK + 3)
-    assert CIRCLE * (ASK + 3) // 2 <= len(pairs) <= CIRCLE * (ASK + 3)
+    pairs, _ = compared_in_a_circle({}, otherwise=SURELY, depth=AT_A_TIME + 3)
+    assert CIRCLE * (AT_A_TIME + 3) // 2 <= len(pairs) <= CIRCLE * (AT_A_TIME + 3)
 
 
 def test_what_was_compared_is_not_compared_again(store: Store, monkeypatch) -> None:

@@ -5,15 +5,15 @@ piece of it is known when places that look alike also lie alike (`retrieval.plac
 places agree, the largest SIFT features are asked as well, if there are any (`retrieval.confirm`).
 
 The counts spread by query expansion: the sure neighbours of my sure neighbours are likely mine.
-So they choose what is compared next, and a photo stops asking once its latest comparisons found
-nothing: most of a long list of candidates teaches nothing.
+So they choose what is compared next (`retrieval.asking`), and whether anything is: most of a long
+list of candidates teaches nothing.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ from scipy import sparse
 
 from colmap_netvlad.cache.ranking import NO_PARTNER, Ranking
 from colmap_netvlad.cache.store import Store
+from colmap_netvlad.retrieval.asking import TAIL, Asking
 from colmap_netvlad.retrieval.confirm import (
     LARGEST_FEATURES,
     Largest,
@@ -28,7 +29,7 @@ from colmap_netvlad.retrieval.confirm import (
     agreeing_features,
 )
 from colmap_netvlad.retrieval.counts import Counts, Known, Pairs
-from colmap_netvlad.retrieval.fusion import expand, keep_best, ranking_of
+from colmap_netvlad.retrieval.fusion import expand, ranking_of
 from colmap_netvlad.retrieval.options import COMPARED
 from colmap_netvlad.retrieval.places import Places, agreeing_matches
 from colmap_netvlad.runtime.progress import step
@@ -59,31 +60,6 @@ EXPANSION_SHARE = 0.4
 """Query expansion. What these constants were chosen by: docs/training-log.md, sections 9 and 20."""
 
 
-@dataclass(frozen=True)
-class Asking:
-    """When an image stops asking for candidates.
-
-    Attributes:
-        at_a_time: candidates that it asks for.
-        patience: it stops after so many in a row that were no sure partners,
-        partners: unless it has fewer sure ones: what hardly overlaps with any other is not to be
-            missed.
-    """
-
-    at_a_time: int
-    patience: int
-    partners: int
-
-
-BY_PLACES = Asking(at_a_time=10, patience=20, partners=2)
-BY_FEATURES = Asking(at_a_time=10, patience=10, partners=3)
-"""Features tell weak partners better. What these were chosen by: docs/training-log.md, sections 10
-and 17."""
-
-TAIL = 1e-3
-"""Weight of the candidates' own order, which decides where nothing agrees."""
-
-
 def rerank(
     candidates: Ranking,
     store: Store,
@@ -94,10 +70,10 @@ def rerank(
 ) -> Ranking:
     """Return a ranking as deep as the candidates', at most `depth` of them compared place by place.
 
-    Each image asks for its best candidates, a few at a time, until some in a row were no sure
-    partners, or to the end where it has hardly any (`Asking`). What was learned so far chooses: a
-    neighbour whom the descriptors overlooked is found by way of its neighbours. Counts are kept
-    in the store: pairs compared before are not compared again.
+    Each image asks for its likeliest partners, a few at a time, until none is likely, or to the end
+    where it has hardly any (`Asking`). What was learned so far chooses: a neighbour whom the
+    descriptors overlooked is found by way of its neighbours. Counts are kept in the store: pairs
+    compared before are not compared again.
 
     Args:
         candidates: by whatever found them, `max(k, depth)` deep where there are as many images.
@@ -107,29 +83,21 @@ def rerank(
         features: the images' largest SIFT features; None: there are none.
     """
     counted = _Counted(store, model, candidates, features)
-    own = TAIL * _own_order(candidates)
-    similarity, seconds = own, 0.0
-    asking = BY_PLACES if features is None else BY_FEATURES
-    most = np.full(len(candidates.names), min(asking.at_a_time, depth - depth // 2), np.intp)
-    asks, left, quiet = most, np.full_like(most, depth), np.zeros_like(most)
-    with step("Comparing photos place by place", len(asks)) as bar:
-        while asks.any():
-            chosen = keep_best(counted.without(similarity), asks)
-            seconds += counted.compare(_pairs_of(chosen))
+    order = _own_order(candidates)
+    asking = Asking(order, depth)
+    votes, seconds, idle = sparse.csr_array(order.shape), 0.0, 0
+    with step("Comparing photos place by place", order.shape[0]) as bar:
+        while (asked := asking.next(_scaled(votes), counted.compared(), counted.sure())).nnz:
+            seconds += counted.compare(_pairs_of(asked))
             start = time.perf_counter()
             agreement = counted.agreement()
-            expanded = expand(agreement, EXPANSION_NEIGHBOURS, EXPANSION_SHARE, max(k, depth))
-            similarity = (expanded + own).tocsr()
-            sure = counted.sure()
-            found = (chosen > 0).multiply(sure).sum(axis=1) > 0
-            quiet = np.where(found, 0, quiet + asks)
-            goes_on = (quiet < asking.patience) | (sure.sum(axis=1) < asking.partners)
-            left = left - asks
-            asked, asks = asks, np.where((asks > 0) & goes_on, np.minimum(most, left), 0)
-            bar.advance(int(np.count_nonzero(asked) - np.count_nonzero(asks)))
+            votes = expand(agreement, EXPANSION_NEIGHBOURS, EXPANSION_SHARE, max(k, depth))
+            now_idle = int(np.count_nonzero(np.diff(asked.indptr) == 0))
+            bar.advance(max(now_idle - idle, 0))
+            idle = max(now_idle, idle)
             seconds += time.perf_counter() - start
-    # Logarithms: twice the matches are not twice as likely to be a true pair.
-    scores = (similarity / CHANCE).log1p()
+        bar.advance(order.shape[0] - idle)
+    scores = _scaled(votes + TAIL * order)
     best = ranking_of(scores, candidates.names, candidates.method, candidates.depth)
     return replace(
         candidates,
@@ -145,6 +113,11 @@ def _pairs_of(similarity: sparse.csr_array) -> Pairs:
     entries = similarity.tocoo()
     pairs = np.sort(np.stack([entries.row, entries.col], axis=1), axis=1)
     return np.unique(pairs, axis=0).astype(np.intp)
+
+
+def _scaled(matches: sparse.csr_array) -> sparse.csr_array:
+    """Return logarithms: twice the matches are not twice as likely to be a true pair."""
+    return (matches / CHANCE).log1p().tocsr()
 
 
 def _own_order(ranking: Ranking) -> sparse.csr_array:
@@ -196,16 +169,13 @@ class _Counted:
         """Return (N, N) symmetric: what agrees beyond chance, in places."""
         return self._matrix(self._beyond)
 
+    def compared(self) -> sparse.csr_array:
+        """Return (N, N) symmetric: 1 for the pairs compared so far."""
+        return self._matrix(np.ones(len(self._pairs)))
+
     def sure(self) -> sparse.csr_array:
         """Return (N, N) symmetric: 1 for sure partners."""
         return self._matrix(self._sure.astype(np.float64))
-
-    def without(self, similarity: sparse.csr_array) -> sparse.csr_array:
-        """Return a similarity without the pairs compared so far."""
-        done = self._matrix(np.ones(len(self._pairs)))
-        rest = (similarity - similarity * done).tocsr()
-        rest.eliminate_zeros()
-        return rest
 
     def _matrix(self, values: NDArray[np.float64]) -> sparse.csr_array:
         n = len(self._places.numbers)
