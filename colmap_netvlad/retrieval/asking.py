@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import sparse
 
-from colmap_netvlad.retrieval.fusion import keep_best
+from colmap_netvlad.retrieval.fusion import TAIL, keep_best
 
 AT_A_TIME = 10
 """Candidates that an image asks for, before all look at what was found."""
@@ -40,9 +40,6 @@ constants were chosen by: docs/training-log.md, section 22."""
 FEW = 0.01
 """A pass in which fewer than this share of the images ask is not made: of thousands it takes longer
 than what it compares."""
-
-TAIL = 1e-3
-"""Weight of the candidates' own order, which decides where nothing else does."""
 
 
 class Asking:
@@ -79,7 +76,7 @@ class Asking:
         """
         odds = self._by_rank + VOTES * votes
         rest = (odds - odds * compared).tocsr()
-        found = self._asked.multiply(sure).sum(axis=1)
+        found = (self._asked > 0).multiply(sure).sum(axis=1)
         goes_well = (found > 0) & (found >= GOES_WELL * np.diff(self._asked.indptr))
         on = (sure.sum(axis=1) < PARTNERS) | goes_well
         least = np.where(on, 0.0, LEAST_ODDS - STRANGERS)
@@ -90,5 +87,5 @@ class Asking:
         if np.count_nonzero(numbers) < FEW * len(numbers):
             return sparse.csr_array(asked.shape)
         self._left -= numbers
-        self._asked = (asked > 0).astype(np.float64).tocsr()
+        self._asked = asked
         return asked

@@ -29,7 +29,7 @@ EXPANSION_SHARE = 0.6
 21."""
 
 TAIL = 1e-3
-"""Weight of the rankings' own order in `combine`."""
+"""Weight of the rankings' own order, which decides where nothing else does."""
 
 BLOCK_ROWS = 1024
 """Rows of a sparse product that are in memory at once."""

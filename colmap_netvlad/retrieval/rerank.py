@@ -21,7 +21,7 @@ from scipy import sparse
 
 from colmap_netvlad.cache.ranking import NO_PARTNER, Ranking
 from colmap_netvlad.cache.store import Store
-from colmap_netvlad.retrieval.asking import TAIL, Asking
+from colmap_netvlad.retrieval.asking import Asking
 from colmap_netvlad.retrieval.confirm import (
     LARGEST_FEATURES,
     Largest,
@@ -29,7 +29,7 @@ from colmap_netvlad.retrieval.confirm import (
     agreeing_features,
 )
 from colmap_netvlad.retrieval.counts import Counts, Known, Pairs
-from colmap_netvlad.retrieval.fusion import expand, ranking_of
+from colmap_netvlad.retrieval.fusion import TAIL, expand, ranking_of
 from colmap_netvlad.retrieval.options import COMPARED
 from colmap_netvlad.retrieval.places import Places, agreeing_matches
 from colmap_netvlad.runtime.progress import step
@@ -92,9 +92,10 @@ def rerank(
             start = time.perf_counter()
             agreement = counted.agreement()
             votes = expand(agreement, EXPANSION_NEIGHBOURS, EXPANSION_SHARE, max(k, depth))
-            now_idle = int(np.count_nonzero(np.diff(asked.indptr) == 0))
-            bar.advance(max(now_idle - idle, 0))
-            idle = max(now_idle, idle)
+            # Who was idle may ask again, but progress does not go back.
+            most_idle = max(idle, int(np.count_nonzero(np.diff(asked.indptr) == 0)))
+            bar.advance(most_idle - idle)
+            idle = most_idle
             seconds += time.perf_counter() - start
         bar.advance(order.shape[0] - idle)
     scores = _scaled(votes + TAIL * order)
