@@ -16,6 +16,7 @@ from typing import BinaryIO
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 
+from colmap_netvlad.photos.exif import exif_of
 from colmap_netvlad.photos.xmp import properties
 
 PHOTO_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"})
@@ -307,7 +308,7 @@ def _day(photo: Image.Image) -> str | None:
 def _detail(photo: Image.Image, tag: int) -> str | None:
     """Return a text of EXIF's own directory, or None where it is missing or broken."""
     try:
-        value = photo.getexif().get_ifd(0x8769).get(tag)
+        value = exif_of(photo).get_ifd(0x8769).get(tag)
     except (KeyError, TypeError, ValueError, ArithmeticError, OSError, SyntaxError, struct.error):
         return None
     return str(value).strip("\0 ") if value is not None else None
@@ -315,7 +316,7 @@ def _detail(photo: Image.Image, tag: int) -> str | None:
 
 def _lens(photo: Image.Image) -> tuple[str, str, float] | None:
     try:
-        exif = photo.getexif()
+        exif = exif_of(photo)
         detail = exif.get_ifd(0x8769)
         make, model = str(exif[0x010F]).strip("\0 "), str(exif[0x0110]).strip("\0 ")
         # As COLMAP: the focal length in 35 mm film where given, else the real one.

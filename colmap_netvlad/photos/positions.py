@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from PIL import UnidentifiedImageError
 
 from colmap_netvlad.photos.bands import named_band
+from colmap_netvlad.photos.exif import exif_of
 from colmap_netvlad.photos.files import open_header
 
 if TYPE_CHECKING:
@@ -126,7 +127,7 @@ def read_gps(photo: Path) -> PosePrior | None:
     """
     try:
         with open_header(photo) as image:
-            gps = image.getexif().get_ifd(GPS_IFD)
+            gps = exif_of(image).get_ifd(GPS_IFD)
         latitude = _degrees(gps[2], gps.get(1, "N"))
         longitude = _degrees(gps[4], gps.get(3, "E"))
         altitude = _altitude(gps)
