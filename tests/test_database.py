@@ -129,13 +129,15 @@ def test_an_empty_file_is_one_sentence(tmp_path: Path) -> None:
         image_names(tmp_path / "project.db")
 
 
-def test_a_locked_database_is_one_sentence(database: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("colmap_netvlad.colmap.database.BUSY_SECONDS", 0.1)
+def test_a_locked_database_is_one_sentence(database: Path) -> None:
     with closing(sqlite3.connect(database)) as other:
         other.execute("PRAGMA locking_mode = EXCLUSIVE")
         other.execute("BEGIN EXCLUSIVE")
-        with pytest.raises(InputError, match="locked by another process"):
-            image_names(database)
+        with (
+            pytest.raises(InputError, match="locked by another process"),
+            open_database(database, wait=0.1),
+        ):
+            pass
 
 
 ids = st.integers(min_value=1, max_value=2147483646)
