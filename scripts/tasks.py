@@ -45,6 +45,9 @@ CORE = [
 
 
 def main(arguments: list[str]) -> int:
+    if "--help" in arguments:
+        print(__doc__.rstrip())
+        return 0
     if not arguments or arguments[0] not in TASKS:
         print(__doc__.rstrip(), file=sys.stderr)
         return 2

@@ -134,6 +134,14 @@ def test_the_core_of_the_tests_is_there(tasks: ModuleType) -> None:
     assert [name for name in tasks.CORE if not (ROOT / name).is_file()] == []
 
 
+def test_help_is_printed_and_nothing_set_up(
+    tasks: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(tasks, "TASKS", {})
+    assert tasks.main(["setup", "--help"]) == 0
+    assert "tasks.py setup [--dev]" in capsys.readouterr().out
+
+
 def test_an_unknown_task_prints_the_list(
     tasks: ModuleType, capsys: pytest.CaptureFixture[str]
 ) -> None:
