@@ -94,7 +94,7 @@ class Counts(Generic[Kind]):
         has = self.has(pairs)
         pairs = pairs[has]
         keys = _joined(np.sort(self.numbers[pairs], axis=1))
-        missing = ~np.isin(keys, self._keys)
+        missing = ~_among(keys, self._keys)
         if missing.any():
             new = pairs[missing]
             self._add(_compare(new, self.numbers, self._store, self._latest, self._agreeing))
@@ -125,6 +125,15 @@ class Counts(Generic[Kind]):
 def _joined(keys: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return (M,) one number for each row of (M, 2) positive numbers below 2^31, in their order."""
     return (keys[:, 0] << 32) + keys[:, 1]
+
+
+def _among(keys: NDArray[np.int64], known: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Return (M,) which keys are among the known ones, which are in order."""
+    # Not `numpy.isin`: it hashes all that is known, each time.
+    at = np.searchsorted(known, keys)
+    found = at < len(known)
+    found[found] = known[at[found]] == keys[found]
+    return found
 
 
 def _compare(

@@ -11,9 +11,10 @@ a photo.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,6 +70,8 @@ BLOCK_ROWS = 512
 """Photos described, and rows multiplied, at once."""
 
 Read = Callable[[int], Cells]
+
+Result = TypeVar("Result")
 
 
 def serves(options: RetrievalOptions, photos: int) -> bool:
@@ -219,16 +222,10 @@ def models_share(words: int) -> float:
 def describe(words: Words, read: Read, photos: int) -> NDArray[np.int8]:
     """Return (N, K A) the descriptors of all photos in these words, a byte a value."""
     codes = np.empty((photos, words.centres.size), np.int8)
-    with (
-        step("Describing photos in the flight's own words", photos) as bar,
-        # A photo is too little work to share: a thread for each of several.
-        threadpool_limits(1, "blas"),
-        ThreadPoolExecutor(usable_processors()) as pool,
-    ):
-        for rows in blocks(photos, BLOCK_PHOTOS):
-            cells = [read(photo) for photo in range(photos)[rows]]
-            codes[rows] = list(pool.map(words.describe, cells))
-            bar.advance(len(cells))
+    with step("Describing photos in the flight's own words", photos) as bar:
+        for photo, descriptor in enumerate(_of_each(words.describe, read, photos)):
+            codes[photo] = descriptor
+            bar.advance()
     return codes
 
 
@@ -237,15 +234,27 @@ def _sample(read: Read, photos: int, count: int, seed: int) -> NDArray[np.float3
     generator = np.random.default_rng(seed)
     each = -(-count // photos)
     drawn = []
-    for photo in range(photos):
-        cells = _textured(read(photo))
+    for cells, rarity in _of_each(_with_rarity, read, photos):
         if len(cells) > each:
-            rarity = _rarity(cells)
-            shares = rarity / rarity.sum()
-            cells = cells[generator.choice(len(cells), each, replace=False, p=shares)]
-        drawn.append(cells)
+            chosen = generator.choice(len(cells), each, replace=False, p=rarity / rarity.sum())
+            drawn.append(cells[chosen])
+        else:
+            drawn.append(cells)
     sample = np.concatenate(drawn)
     return sample if len(sample) else np.ones((1, sample.shape[1]), np.float32)
+
+
+def _of_each(work: Callable[[Cells], Result], read: Read, photos: int) -> Iterator[Result]:
+    """Yield what becomes of each photo's cells, in order."""
+    # A photo is too little work to share: a thread for each of several.
+    with threadpool_limits(1, "blas"), ThreadPoolExecutor(usable_processors()) as pool:
+        for rows in blocks(photos, BLOCK_PHOTOS):
+            yield from pool.map(work, [read(photo) for photo in range(photos)[rows]])
+
+
+def _with_rarity(cells: Cells) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+    textured = _textured(cells)
+    return textured, _rarity(textured)
 
 
 def _textured(cells: Cells) -> NDArray[np.float32]:
