@@ -175,8 +175,11 @@ class Words:
         """Return the descriptor of a photo, (K A,), as `cache.codes.encode` keeps it."""
         vectors = _textured(cells)
         x = _unit(vectors @ self.axes)
-        scores = self.hardness * (x @ _unit(self.centres).T)
-        weights = np.exp(scores - scores.max(axis=1, keepdims=True))
+        # In place: new memory for a value of each cell and word costs more than the arithmetic.
+        weights = x @ _unit(self.centres).T
+        weights *= self.hardness
+        weights -= weights.max(axis=1, keepdims=True)
+        np.exp(weights, out=weights)
         weights *= (_rarity(vectors) / weights.sum(axis=1))[:, None]
         residuals = weights.T @ x - weights.sum(axis=0)[:, None] * self.centres
         lengths = np.linalg.norm(residuals, axis=1, keepdims=True)
