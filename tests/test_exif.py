@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from photos import scene
 from PIL import Image, PngImagePlugin
 
+from colmap_netvlad.photos.accuracy import read_deviations
 from colmap_netvlad.photos.exif import exif_of
 from colmap_netvlad.photos.files import read_header
 from colmap_netvlad.photos.positions import read_gps
@@ -78,3 +79,15 @@ def test_pixels_are_whole_after_exif_was_looked_for_behind_them() -> None:
     with Image.open(BytesIO(png(tags(), behind=True))) as photo:
         assert exif_of(photo)[MODEL] == "FC6310"
         assert photo.tobytes() == Image.fromarray(scene()).tobytes()
+
+
+def test_a_photo_whose_exif_is_broken_has_no_position(tmp_path: Path) -> None:
+    file = BytesIO()
+    Image.fromarray(scene()).save(file, "JPEG", dpi=(72, 72))
+    data, junk = file.getvalue(), b"Exif\0\0XXXXXXXXjunkjunk"
+    end = 4 + int.from_bytes(data[4:6], "big")
+    segment = b"\xff\xe1" + (len(junk) + 2).to_bytes(2, "big") + junk
+    (tmp_path / "photo.jpg").write_bytes(data[:end] + segment + data[end:])
+    assert read_header(tmp_path / "photo.jpg").lens is None
+    assert read_gps(tmp_path / "photo.jpg") is None
+    assert read_deviations(tmp_path / "photo.jpg") is None

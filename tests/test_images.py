@@ -228,6 +228,19 @@ def test_masked_areas_become_neutral_and_photos_without_a_mask_are_taken_whole(
     assert (masked[:, :, :48] == plain[:, :, :48]).all()
 
 
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_a_mask_lies_over_the_photo_as_it_is_stored(tmp_path: Path, orientation: int) -> None:
+    """As COLMAP lays it, whatever way up the photo is."""
+    stored = np.full((64, 96, 3), 120, np.uint8)
+    stored[:32, :32] = (250, 250, 250)
+    save_jpeg(tmp_path / "photo.jpg", stored, orientation=orientation)
+    mask = np.full((64, 96), 255, np.uint8)
+    mask[:32, :32] = 0
+    cv2.imwrite(str(tmp_path / "photo.jpg.png"), mask)
+    (batch,) = load_batches(tmp_path, ["photo.jpg"], 96, 1, masks=tmp_path)
+    assert np.abs(batch.pixels.astype(int) - 120).mean() < 1
+
+
 def test_a_broken_mask_is_a_reason_to_leave_the_photo_out(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "a.png"), np.full((32, 32, 3), 9, np.uint8))
     (tmp_path / "a.png.png").write_bytes(b"no mask")

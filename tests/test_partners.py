@@ -80,6 +80,14 @@ def test_a_sequence_counts_numbers_as_numbers_and_stays_in_its_folder() -> None:
     assert len(sequential_pairs(names, 9)) == 3
 
 
+def test_signs_that_look_like_digits_are_letters() -> None:
+    assert sequential_pairs(["x10.jpg", "\u24601.jpg", "x\u00b22.jpg", "x9.jpg"], 1) == [
+        ("x9.jpg", "x10.jpg"),
+        ("x10.jpg", "x\u00b22.jpg"),
+        ("x\u00b22.jpg", "\u24601.jpg"),
+    ]
+
+
 def test_the_user_s_pairs_are_joined_in_once_and_in_order() -> None:
     names = ["a", "b", "c"]
     pairs = [ImagePair("a", "c", 0.5, 1)]

@@ -129,7 +129,7 @@ def in_order(pairs: Iterable[ImagePair], names: Sequence[str]) -> list[ImagePair
 
 def _natural(name: str) -> list[tuple[int, int, str]]:
     return [
-        (0, int(part), "") if part.isdigit() else (1, 0, part)
+        (0, int(part), "") if part.isdecimal() else (1, 0, part)
         for part in re.split(r"(\d+)", name)
         if part
     ]

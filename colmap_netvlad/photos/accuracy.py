@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from colmap_netvlad.photos.exif import exif_of
+from colmap_netvlad.photos.exif import FAULTS, exif_of
 from colmap_netvlad.photos.files import open_header
 from colmap_netvlad.photos.positions import GPS_IFD
 from colmap_netvlad.photos.xmp import properties
@@ -28,7 +28,7 @@ def read_deviations(photo: Path) -> tuple[float, float, float] | None:
         with open_header(photo) as image:
             xmp = properties(image)
             gps = exif_of(image).get_ifd(GPS_IFD)
-    except (OSError, SyntaxError, ValueError, TypeError):
+    except FAULTS:
         return None
     try:
         east, north, up = (float(xmp[name]) for name in RTK_DEVIATIONS)

@@ -16,7 +16,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_netvlad.photos.files import BadPhoto, is_jpeg, parse_header, photo_path, read_bytes
+from colmap_netvlad.photos.files import (
+    BadPhoto,
+    is_jpeg,
+    parse_header,
+    photo_path,
+    read_bytes,
+    read_header,
+)
 from colmap_netvlad.photos.masks import find_mask, neutralise
 from colmap_netvlad.runtime.machine import usable_processors
 
@@ -102,9 +109,10 @@ def load_batches(
     """
 
     def decode(name: str) -> NDArray[np.uint8]:
-        pixels = decode_photo(photo_path(folder, name), long_side)
+        path = photo_path(folder, name)
+        pixels = decode_photo(path, long_side)
         mask = find_mask(masks, name) if masks is not None else None
-        return pixels if mask is None else neutralise(pixels, mask)
+        return pixels if mask is None else neutralise(pixels, mask, read_header(path).orientation)
 
     workers = workers or usable_processors()
     waiting: dict[tuple[int, ...], list[tuple[str, NDArray[np.uint8]]]] = defaultdict(list)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import struct
 from typing import IO
 from zlib import crc32
 
@@ -11,6 +12,10 @@ from PIL.PngImagePlugin import PngImageFile
 
 TAIL_BYTES = 128 * 1024
 """EXIF behind a PNG's pixels begins within these: its chunk is 64 KiB at most in what writes it."""
+
+FAULTS = (KeyError, TypeError, ValueError, ArithmeticError, OSError, SyntaxError, struct.error)
+"""What reading a tag raises where it is missing or broken, or the file cannot be opened: the pixels
+may well be whole."""
 
 
 def exif_of(photo: Image.Image) -> Image.Exif:

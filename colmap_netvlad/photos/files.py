@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import struct
 import threading
 import warnings
 from collections.abc import Iterator, Mapping
@@ -16,7 +15,7 @@ from typing import BinaryIO
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 
-from colmap_netvlad.photos.exif import exif_of
+from colmap_netvlad.photos.exif import FAULTS, exif_of
 from colmap_netvlad.photos.xmp import properties
 
 PHOTO_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"})
@@ -26,7 +25,7 @@ PHOTO_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".
 MIN_SIDE = 16
 """Photos with a shorter side than this hold nothing to describe, px."""
 
-DATE_TIME_ORIGINAL, BODY_SERIAL_NUMBER = 0x9003, 0xA431
+ORIENTATION, DATE_TIME_ORIGINAL, BODY_SERIAL_NUMBER = 0x0112, 0x9003, 0xA431
 """EXIF tags."""
 
 XMP_SERIAL_NUMBERS = (
@@ -76,6 +75,7 @@ class PhotoHeader:
         day: when the photo was taken, `YYYY:MM:DD` of EXIF.
         exposure: number of the shot that a multispectral camera's bands have in common, of XMP.
         band: which band of it the photo is, of XMP.
+        orientation: how the stored pixels are to be turned, 1..8 as in EXIF; 1: not at all.
     """
 
     width: int
@@ -85,6 +85,7 @@ class PhotoHeader:
     day: str | None = None
     exposure: str | None = None
     band: str | None = None
+    orientation: int = 1
 
 
 def find_photos(folder: Path) -> list[str]:
@@ -226,6 +227,7 @@ def parse_header(file: BinaryIO) -> PhotoHeader:
                 _day(photo),
                 next((xmp[key] for key in XMP_EXPOSURES if xmp.get(key)), None),
                 xmp.get(XMP_BAND) or None,
+                _orientation(photo),
             )
     except UnidentifiedImageError as fault:
         raise BadPhoto("is not a photo") from fault
@@ -305,11 +307,19 @@ def _day(photo: Image.Image) -> str | None:
     return taken[:10] if taken else None
 
 
+def _orientation(photo: Image.Image) -> int:
+    try:
+        said = int(exif_of(photo).get(ORIENTATION, 1))
+    except FAULTS:
+        return 1
+    return said if 1 <= said <= 8 else 1
+
+
 def _detail(photo: Image.Image, tag: int) -> str | None:
     """Return a text of EXIF's own directory, or None where it is missing or broken."""
     try:
         value = exif_of(photo).get_ifd(0x8769).get(tag)
-    except (KeyError, TypeError, ValueError, ArithmeticError, OSError, SyntaxError, struct.error):
+    except FAULTS:
         return None
     return str(value).strip("\0 ") if value is not None else None
 
@@ -321,6 +331,6 @@ def _lens(photo: Image.Image) -> tuple[str, str, float] | None:
         make, model = str(exif[0x010F]).strip("\0 "), str(exif[0x0110]).strip("\0 ")
         # As COLMAP: the focal length in 35 mm film where given, else the real one.
         focal = float(detail[0xA405] if 0xA405 in detail else detail[0x920A])
-    except (KeyError, TypeError, ValueError, ArithmeticError, OSError, SyntaxError, struct.error):
-        return None  # no such tags, or broken ones: the pixels may well be whole
+    except FAULTS:
+        return None
     return (make, model, focal) if make and model else None

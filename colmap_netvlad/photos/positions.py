@@ -14,10 +14,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import UnidentifiedImageError
 
 from colmap_netvlad.photos.bands import named_band
-from colmap_netvlad.photos.exif import exif_of
+from colmap_netvlad.photos.exif import FAULTS, exif_of
 from colmap_netvlad.photos.files import open_header
 
 if TYPE_CHECKING:
@@ -131,7 +130,7 @@ def read_gps(photo: Path) -> PosePrior | None:
         latitude = _degrees(gps[2], gps.get(1, "N"))
         longitude = _degrees(gps[4], gps.get(3, "E"))
         altitude = _altitude(gps)
-    except (OSError, UnidentifiedImageError, KeyError, ValueError, TypeError, ZeroDivisionError):
+    except FAULTS:
         return None
     if not np.isfinite([latitude, longitude]).all():
         return None

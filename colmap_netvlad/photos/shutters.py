@@ -17,7 +17,7 @@ from statistics import median
 
 import numpy as np
 
-from colmap_netvlad.photos.exif import exif_of
+from colmap_netvlad.photos.exif import FAULTS, exif_of
 from colmap_netvlad.photos.files import BadPhoto, open_header, photo_path
 from colmap_netvlad.photos.positions import read_gps
 from colmap_netvlad.photos.xmp import properties
@@ -154,7 +154,7 @@ def _read(images: Path, name: str, number: int) -> _Taken | None:
             model = str(exif.get(0x0110, "")).strip("\0 ")
             detail = exif.get_ifd(0x8769)
             large = photo.width * photo.height > LARGE
-    except (BadPhoto, OSError, SyntaxError, ValueError, TypeError, KeyError):
+    except (BadPhoto, *FAULTS):
         return None
     if model.upper() in ROLLING:
         drone, readout = ROLLING[model.upper()]
