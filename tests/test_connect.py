@@ -30,16 +30,12 @@ def test_one_hopeless_link_does_not_starve_another() -> None:
     similarity = np.zeros((n, n))
     similarity[:10, 10:20] = 5.0
     similarity[0, 20] = 0.1
+    matrix, names = sparse.csr_array(similarity + similarity.T), [f"{i:02d}" for i in range(n)]
     pairs = [(i, i + 1) for i in range(9)] + [(i, i + 1) for i in range(10, 19)]
-    chosen = connecting_pairs(
-        sparse.csr_array(similarity + similarity.T),
-        components(n, pairs),
-        [],
-        [f"{i:02d}" for i in range(n)],
-        10,
-    )
+    chosen = connecting_pairs(matrix, components(n, pairs), [], names, 10)
     assert len(chosen) == TRIES_PER_LINK + 1
     assert (0, 20) in chosen
+    assert (0, 20) in connecting_pairs(matrix, components(n, pairs), [], names, TRIES_PER_LINK)
 
 
 def test_what_stays_apart_is_listed_briefly() -> None:

@@ -52,10 +52,10 @@ def connecting_pairs(
     names: Sequence[str],
     budget: int,
 ) -> list[IndexPair]:
-    """Return at most `budget` untested candidates between components, the best first.
+    """Return at most `budget` untested candidates between components.
 
-    Between any two components at most `TRIES_PER_LINK`, so that one hopeless pair of components
-    does not use up what others need.
+    The best between any two components come first, then their second best, up to
+    `TRIES_PER_LINK`, so that one hopeless pair of components does not use up what others need.
 
     Args:
         similarity: (N, N) symmetric sparse similarity of the candidates.
@@ -77,12 +77,11 @@ def connecting_pairs(
     )
     known = set(tested)
     tries: Counter[frozenset[int]] = Counter()
-    chosen: list[IndexPair] = []
+    chosen: list[tuple[int, IndexPair]] = []
     for _, (i, j) in candidates:
-        if len(chosen) == budget:
-            break
         link = frozenset((int(component[i]), int(component[j])))
         if (i, j) not in known and tries[link] < TRIES_PER_LINK:
+            chosen.append((tries[link], (i, j)))
             tries[link] += 1
-            chosen.append((i, j))
-    return chosen
+    chosen.sort(key=lambda item: item[0])
+    return [pair for _, pair in chosen[:budget]]
