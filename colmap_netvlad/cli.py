@@ -539,6 +539,8 @@ def viewgraph(database: Path | None, graphml: Path | None, as_json: bool) -> Non
         print_json(statistics)
     else:
         say(*statistics_lines(statistics))
+        if graphml is not None:
+            say(f"The graph is in {graphml}.")
 
 
 @cli.command()

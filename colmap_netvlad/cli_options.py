@@ -345,7 +345,10 @@ FEATURES: tuple[Callable[[Any], Any], ...] = (
         help="Longer side at which SIFT runs, px.  [default: COLMAP's, 3200]",
     ),
     click.option(
-        "--max-features", default=8192, show_default=True, help="Most features of a photo."
+        "--max-features",
+        default=8192,
+        show_default=True,
+        help="About the most features of a photo: COLMAP keeps up to three quarters more.",
     ),
     click.option(
         "--threads",

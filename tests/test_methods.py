@@ -219,11 +219,14 @@ def test_a_database_without_features_is_said(name: str, tmp_path: Path) -> None:
         rank(project, name)
 
 
-def test_bow_leaves_the_database_alone_and_says_which_tree(project_copy: MakeProject) -> None:
+def test_bow_leaves_the_database_alone_and_says_which_tree(
+    project_copy: MakeProject, capfd: pytest.CaptureFixture[str]
+) -> None:
     project = project_copy(matched=True)
     before = hashlib.sha256(project.database.read_bytes()).hexdigest()
     ranking = rank(project, "bow", RetrievalOptions(k=3))
     assert "built from this project's own descriptors" in ranking.notes[0]
+    assert "WARNING" not in capfd.readouterr().err, "faiss would like fewer words"
     assert hashlib.sha256(project.database.read_bytes()).hexdigest() == before
     (tree,) = project.folder.glob("*.bin")
     built = tree.stat().st_mtime_ns

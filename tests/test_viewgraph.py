@@ -216,6 +216,7 @@ def test_command_prints_where_the_model_splits_and_writes_graphml(tmp_path: Path
         "Images without a verified pair: 1: d.jpg.",
         "Images whose loss splits the model: 1: b.jpg.",
         "Pairs whose loss splits the model: 2: a.jpg b.jpg, b.jpg c.jpg.",
+        f"The graph is in {graphml}.",
     ]
     assert nx.read_graphml(graphml).number_of_edges() == 2
     assert path.read_bytes() == before

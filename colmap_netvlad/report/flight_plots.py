@@ -69,7 +69,10 @@ def plan(
         tips = gps[known][:, :2] + stretch * vectors
         axes.add_collection(
             LineCollection(
-                list(np.stack([gps[known][:, :2], tips], axis=1)), colors="#d55e00", linewidths=0.9
+                list(np.stack([gps[known][:, :2], tips], axis=1)),
+                colors="#d55e00",
+                linewidths=1.1,
+                zorder=4.5,
             )
         )
         _dots(axes, centres[:, :2], s=size, marker="s", color=CAMERA, linewidths=0, zorder=3)
@@ -295,6 +298,7 @@ def photo_histogram(keypoints: NDArray[np.int64], seen: NDArray[np.int64]) -> st
         axes.hist(keypoints, edges, color=GREY, alpha=0.55, label="keypoints")
         axes.hist(seen, edges, color=COLOURS[0], alpha=0.8, label="that see a point")
         axes.legend(frameon=False, fontsize=8)
+        axes.yaxis.set_major_locator(MaxNLocator(integer=True))
         _label(axes, "keypoints of a photo", "photos")
         return svg_text(figure)
 
@@ -336,13 +340,14 @@ def _legend_below(figure: Figure, handles: Sequence[Artist], columns: int = 5) -
 
 
 def _stretch(vectors: Floats, places: Floats) -> float:
-    """By how much to stretch vectors so that the usual one is a fortieth of the plan."""
+    """By how much to stretch vectors so that the usual one is a twelfth of the plan: longer than
+    a marker."""
     places = places[np.isfinite(places).all(axis=1)]
     if not len(vectors) or not len(places):
         return 1.0
     usual = float(np.median(np.linalg.norm(vectors, axis=1)))
     wide = float(np.ptp(places, axis=0).max())
-    return max(_round_down(wide / 40 / usual), 1.0) if usual > 0 and wide > 0 else 1.0
+    return max(_round_down(wide / 12 / usual), 1.0) if usual > 0 and wide > 0 else 1.0
 
 
 def _round_down(value: float) -> float:

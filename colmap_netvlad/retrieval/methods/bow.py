@@ -8,8 +8,10 @@ where COLMAP has cached it; one built from the project's own descriptors, kept b
 from __future__ import annotations
 
 import hashlib
+import os
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -137,11 +139,24 @@ def _build(
     options.num_rounds = 1
     options.num_threads = 1  # with several, faiss's k-means now and then gives another tree
     values = sample.astype(np.float32)
-    index.build(
-        options, pycolmap.FeatureDescriptorsFloat(pycolmap.FeatureExtractorType.SIFT, values)
-    )
+    descriptors = pycolmap.FeatureDescriptorsFloat(pycolmap.FeatureExtractorType.SIFT, values)
+    with _silent():
+        index.build(options, descriptors)
     index.write(tree)
     advance(1)
+
+
+@contextmanager
+def _silent() -> Iterator[None]:
+    """Keep from the terminal what faiss prints by itself: that it would like fewer words."""
+    terminal = os.dup(2)
+    with Path(os.devnull).open("wb") as nothing:
+        os.dup2(nothing.fileno(), 2)
+    try:
+        yield
+    finally:
+        os.dup2(terminal, 2)
+        os.close(terminal)
 
 
 def _query(
