@@ -23,13 +23,16 @@ def scene(seed: int = 0, width: int = WIDTH, height: int = HEIGHT) -> NDArray[np
 
 
 def save_jpeg(path: Path, pixels: NDArray[np.uint8], **exif: object) -> None:
-    """Save as JPEG; keywords are EXIF: make, model, focal (35 mm), orientation."""
+    """Save as JPEG; keywords are EXIF: make, model, focal (35 mm), orientation, detail (tags)."""
     tags = Image.Exif()
     for key, tag in (("make", 0x010F), ("model", 0x0110), ("orientation", 0x0112)):
         if key in exif:
             tags[tag] = exif[key]
+    detail = exif.get("detail", {})
     if "focal" in exif:
-        tags[0x8769] = {0xA405: exif["focal"]}
+        detail = {0xA405: exif["focal"], **detail}
+    if detail:
+        tags[0x8769] = detail
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(pixels).save(path, quality=95, exif=tags)
 

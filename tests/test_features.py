@@ -12,6 +12,7 @@ import pytest
 from click.testing import CliRunner
 from photos import BROKEN, HEIGHT, SOUND, WIDTH, save_jpeg, scene
 from PIL import Image
+from PIL.TiffImagePlugin import IFDRational
 
 from colmap_netvlad.cli import cli
 from colmap_netvlad.colmap import engine
@@ -42,6 +43,26 @@ def images(tmp_path: Path) -> Path:
     for i in range(3):
         save_jpeg(folder / f"{i}.jpg", scene(i))
     return folder
+
+
+@pytest.mark.parametrize("camera", ["auto", "per-image"])
+@pytest.mark.parametrize(("taken", "unit"), [(WIDTH, 2), (4 * WIDTH, 2), (2 * WIDTH, 3)])
+def test_the_focal_length_is_that_of_the_file_also_where_photos_were_made_smaller(
+    tmp_path: Path, camera: str, taken: int, unit: int
+) -> None:
+    """EXIF's focal plane is that of the photo as it was taken; COLMAP takes it for the file's."""
+    resolution = {2: 1016, 3: 400}[unit] * taken // WIDTH
+    plane = {0x920A: IFDRational(5), 0xA20E: IFDRational(resolution), 0xA210: unit, 0xA002: taken}
+    images = tmp_path / "images"
+    for i in range(2):
+        save_jpeg(images / f"{i}.jpg", scene(i), make="Canon", model="S100", detail=plane)
+    extract(images, camera=camera)
+    with engine.opened(tmp_path / "project.db") as database:
+        cameras = database.read_all_cameras()
+    assert len(cameras) == (2 if camera == "per-image" else 1)
+    for one in cameras:
+        assert one.has_prior_focal_length
+        assert one.mean_focal_length() == pytest.approx(200.0, rel=1e-3)
 
 
 def test_sound_photos_of_every_kind_are_imported_and_broken_ones_listed(tmp_path: Path) -> None:

@@ -30,6 +30,7 @@ from colmap_netvlad.photos.files import (
     find_photos,
     read_header,
 )
+from colmap_netvlad.photos.focal import plane_focal
 from colmap_netvlad.photos.folders import photo_folders
 from colmap_netvlad.photos.masks import find_mask
 from colmap_netvlad.runtime import progress, workers
@@ -43,6 +44,9 @@ CHUNK_PHOTOS = 8
 SHARE_PHOTOS = 4
 """Photos of the smallest share for another machine: each call of COLMAP's makes SIFT's scale space
 anew, which takes an eighth of a photo's time."""
+
+SAME_FOCAL = 0.001
+"""Focal lengths whose ratio is nearer to one than this are the same: EXIF has five digits."""
 
 SIFT_LONG_SIDE = 3200
 """COLMAP's limit for SIFT where no max image size is given, px."""
@@ -338,6 +342,27 @@ def _import(
         reader.existing_camera_id = group.camera_id
     with engine.faults_said():
         pycolmap.import_images(database, images, group.mode, list(names), reader)
+    if group.camera_id is None:
+        _mend_focal_lengths(images, database, names)
+
+
+def _mend_focal_lengths(images: Path, database: Path, names: Sequence[str]) -> None:
+    """Scale the focal lengths of new cameras whose photos were made smaller.
+
+    Where EXIF has no focal length on 35 mm film, COLMAP goes by the resolution of the focal plane,
+    and that stays what it was when the photo was taken.
+    """
+    with engine.opened(database) as colmap:
+        for name in names:
+            focal = plane_focal(images / name)
+            image = colmap.read_image_with_name(name) if focal else None
+            if focal is None or image is None:
+                continue
+            camera = colmap.read_camera(image.camera_id)
+            if abs(camera.mean_focal_length() / focal.taken - 1) < SAME_FOCAL:
+                for index in camera.focal_length_idxs():
+                    camera.params[index] *= focal.stored / focal.taken
+                colmap.update_camera(camera)
 
 
 def _new_camera(images: Path, database: Path, group: _Group, options: FeatureOptions) -> int | None:
