@@ -22,6 +22,7 @@ from colmap_netvlad.cli import cli
 from colmap_netvlad.colmap.database import image_names, open_database
 from colmap_netvlad.commands.report import find_positions, model_of, report, save_run
 from colmap_netvlad.demo.simulate import FOCAL, SimulationOptions, simulate_flight
+from colmap_netvlad.graph.lookalikes import Lookalike
 from colmap_netvlad.mapping.incremental import map_incremental
 from colmap_netvlad.photos.shutters import RollingShutter
 from colmap_netvlad.report import missing as reasons
@@ -245,6 +246,27 @@ def test_positions_of_another_flight_are_red(grid):
     quality = measure(Source("f", grid, Path("m"), positions=positions))
     (check,) = (check for check in judge(quality) if check.title == "Against GPS")
     assert check.level == "red" and "bent or folded" in check.reason
+
+
+def test_the_verdict_says_which_positions_its_gps_error_leaves_out(grid):
+    data = read_model_data(grid)
+    positions = dict(zip(data.names, data.centres + np.array([100, 200, 300]), strict=True))
+    positions[data.names[7]] += [0, 90, 0]
+    quality = measure(Source("f", grid, Path("m"), positions=positions))
+    lines = verdict_lines(quality, judge(quality), Path("report.html"))
+    assert lines[3].endswith("(root mean square, 1 photo far from its GPS left out).")
+
+
+def test_pairs_in_doubt_are_not_called_none(mapped):
+    model = pycolmap.Reconstruction(mapped / "sparse/0")
+    database = mapped / "project.db"
+    quality = measure(Source("f", model, mapped / "sparse/0", database))
+    doubt = Lookalike(("a", "b"), 20, "Tilted.", False, 1.5)
+    values = {}
+    for found in ([], [doubt], [doubt, replace(doubt, contradicted=True)]):
+        checks = judge(replace(quality, lookalikes=found))
+        values[len(found)] = {c.title: c.value for c in checks}["Look-alikes"]
+    assert values == {0: "none found", 1: "none contradicted, 1 doubtful", 2: "1 pair"}
 
 
 def test_only_all_is_hundred_per_cent():

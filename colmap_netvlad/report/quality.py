@@ -404,7 +404,11 @@ def _lookalikes(quality: Quality) -> Check | None:
         return None
     title, found = "Look-alikes", [one for one in quality.lookalikes if one.contradicted]
     if not found:
-        return Check(title, "none found", "green", "No verified pair contradicts the others.")
+        reason = "No verified pair contradicts the others."
+        if doubtful := len(quality.lookalikes):
+            value = f"none contradicted, {doubtful:,} doubtful"
+            return Check(title, value, "green", f"{reason} Those in doubt are shown below.")
+        return Check(title, "none found", "green", reason)
     value = f"{len(found):,} pair{_s(len(found))}"
     if quality.source.run is not None and quality.source.run.dropped:
         reason = "They were left out before mapping; what they look like is shown below."
@@ -475,6 +479,10 @@ def verdict_lines(quality: Quality, checks: Sequence[Check], page: Path) -> list
     registered = by_title["Photos registered"]
     model = quality.data
     ground = [text for text in (area(quality), pixel_size(quality)) if text != NOT_KNOWN]
+    aside = int(quality.frame.outliers.sum())
+    left_out = (
+        f", {aside:,} photo{_s(aside)} far from {'its' if aside == 1 else 'their'} GPS left out"
+    )
     if quality.overlap is not None:
         share = by_title[f"Ground seen by {ENOUGH} photos or more"].value
         ground.append(f"{share} of it seen by {ENOUGH} photos or more")
@@ -482,12 +490,12 @@ def verdict_lines(quality: Quality, checks: Sequence[Check], page: Path) -> list
     return [
         f"Verdict: {worst.upper()}{why}. Photos registered: {registered.value}. "
         f"{'' if registered.level == 'green' else registered.reason}".rstrip(),
-        f"Ground: {', '.join(ground) or NOT_KNOWN}.",
+        f"Ground between the cameras: {', '.join(ground) or NOT_KNOWN}.",
         f"Model: {len(model.points):,} points, seen by {number(model.mean_track_length, '', 2)} "
         f"photos each; reprojection error {number(model.mean_error, 'px', 2)}.",
         "GPS: no positions to compare with."
         if gps is None
-        else f"GPS: {by_title['Against GPS'].value} (root mean square).",
+        else f"GPS: {by_title['Against GPS'].value} (root mean square{left_out if aside else ''}).",
         f"Report: {page}",
     ]
 
