@@ -764,7 +764,7 @@ def train(
 
     options = settings_of(context, recipe)
     measured = load_dataset(validation)
-    scenes = load_dataset(datasets, (*leave_out, *(scene.name for scene in measured)))
+    scenes = load_dataset(datasets, leave_out, measured)
     report = run(scenes, measured, options, output, device=device, name=name)
     say(*report_lines(report))
     finish_partial(report.left_out)

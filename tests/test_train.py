@@ -25,7 +25,7 @@ from colmap_netvlad.training import run as run_module
 from colmap_netvlad.training.augment import View
 from colmap_netvlad.training.history import Epoch, draw_curves
 from colmap_netvlad.training.inputs import KeptFeatures, Photos
-from colmap_netvlad.training.options import TrainOptions, read_recipe
+from colmap_netvlad.training.options import BOUNDS, TrainOptions, read_recipe
 from colmap_netvlad.training.run import Run, train
 from colmap_netvlad.training.scenes import Scene, symmetric
 from colmap_netvlad.training.stages import SplitNetwork, stages_of
@@ -473,7 +473,26 @@ def test_recipes_are_read_and_checked(tmp_path: Path) -> None:
     ("settings", "said"),
     [
         ({"loss": "softest"}, "`loss` is 'softest'; it is one of ranked-list"),
-        ({"epochs": 0}, "`epochs` is 0"),
+        ({"epochs": 0}, "`epochs` is 0; it must be at least 1"),
+        ({"momentum": 1.5}, "`momentum` is 1.5; it must be at least 0 and less than 1"),
+        ({"weight_decay": -1.0}, "`weight_decay` is -1.0; it must be at least 0"),
+        ({"seed": -1}, "`seed` is -1; it must be at least 0 and at most 2147483647"),
+        ({"flight_photos": 0, "mining": "flight"}, "`flight_photos` is 0"),
+        ({"views": -1, "frozen": "conv5_2"}, "`views` is -1"),
+        ({"width": 8, "height": 8}, "`width` is 8"),
+        ({"rotation": -5.0}, "`rotation` is -5.0"),
+        ({"illumination": -1.0}, "`illumination` is -1.0"),
+        ({"warm_up": -5}, "`warm_up` is -5"),
+        ({"head_rate": -1.0}, "`head_rate` is -1.0"),
+        ({"hard_negatives": 0}, "`hard_negatives` is 0"),
+        ({"same_flight": -1}, "`same_flight` is -1"),
+        ({"upright": 3.0}, "`upright` is 3.0"),
+        ({"keep_local": -1.0}, "`keep_local` is -1.0; it must be more than 0 and at most 1"),
+        ({"alpha": -1.0}, "`alpha` is -1.0"),
+        ({"learning_rate": float("inf")}, "`learning_rate` is inf; it must be finite and more"),
+        ({"margin": float("nan")}, "`margin` is nan; it must be finite and at least 0"),
+        ({"pseudo_views": 2}, "`pseudo_views` is 2; it must be 0 or more than `positives`"),
+        ({"scenes_per_batch": 1}, "`scenes_per_batch` is 1, so that no anchor has a negative"),
         ({"scale_max": 0.1}, "below `scale_min`"),
         ({"rotations": 3}, "`rotations` is 3"),
         ({"views": 2}, "say with `frozen`"),
@@ -482,6 +501,20 @@ def test_recipes_are_read_and_checked(tmp_path: Path) -> None:
 def test_settings_that_cannot_work_are_refused(settings: dict[str, object], said: str) -> None:
     with pytest.raises(InputError, match=said):
         TrainOptions(**settings)  # type: ignore[arg-type]
+
+
+def test_every_number_among_the_settings_has_a_range_that_holds_its_default() -> None:
+    for item in dataclasses.fields(TrainOptions):
+        kind = item.metadata.get("type", type(item.default))
+        if kind in (int, float) and item.name != "rotations":  # which is 1 or 4
+            assert set(item.metadata) & set(BOUNDS), item.name
+    TrainOptions()
+
+
+@pytest.mark.parametrize("name", ["netvlad-o", "netvlad-o-lite", "paper"])
+def test_the_recipes_that_come_with_the_project_can_be_trained(name: str) -> None:
+    recipes = Path(__file__).parent.parent / "scripts" / "recipes"
+    TrainOptions(**read_recipe(recipes / f"{name}.toml"))
 
 
 def test_the_defaults_are_the_papers_recipe() -> None:
