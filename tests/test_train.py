@@ -285,6 +285,47 @@ def test_correspondences_need_to_know_where_points_are_and_take_no_teacher(
         train(flights[:2], [], change(options, teacher="start"), tmp_path / "run")
 
 
+def test_a_network_to_start_from_settles_its_kind_whatever_the_settings_say(
+    flights: list[Scene], options: TrainOptions, tmp_path: Path
+) -> None:
+    """Alpha of eq. 11, the card and the check of the loss follow the GeM, not `aggregation`."""
+    gem = change(options, aggregation="gem", views=1)
+    Run(flights[:2], [], gem, tmp_path / "gem")
+    start = TrainOptions(
+        start=str(tmp_path / "gem" / "initial.safetensors"),
+        positives=2,
+        epsilon=10,
+        width=96,
+        height=64,
+    )
+    run = Run(flights[:2], [], start, tmp_path / "run")
+    assert run.options.for_losses().alpha == 0.9
+    recipe = read_metadata(tmp_path / "run" / "initial.safetensors")["recipe"]
+    assert (recipe["aggregation"], recipe["trunk"]) == ("gem", LITE)
+    points = change(start, loss="correspondence", pseudo_views=4)
+    with pytest.raises(InputError, match="of a NetVLAD, but the network's aggregation is gem"):
+        Run(flights[:2], [], points, tmp_path / "points")
+
+
+def test_a_run_begun_anew_is_taught_by_its_own_beginning(
+    flights: list[Scene], options: TrainOptions, tmp_path: Path
+) -> None:
+    """The run before in the folder left its `initial.safetensors`."""
+    options = change(options, teacher="start", aggregation="gem", epochs=1, iterations=1)
+    train(flights[:2], [], options, tmp_path / "anew" / "run")
+    (tmp_path / "anew" / "run" / "checkpoint.pt").unlink()
+    for folder in ("anew", "fresh"):
+        netvlad = change(options, aggregation="netvlad")
+        run = Run(flights[:2], [], netvlad, tmp_path / folder / "run")
+        assert run.teacher is not None
+        assert run.teacher.similarities([(0, 0), (0, 1)]).shape == (2, 2)
+    one, other = (tmp_path / folder / "run" for folder in ("anew", "fresh"))
+    initial = (one / "initial.safetensors").read_bytes()
+    assert initial == (other / "initial.safetensors").read_bytes()
+    taught = [set(path.name for path in (f / "cache").glob("teacher-*")) for f in (one, other)]
+    assert taught[1] < taught[0], "both were taught by the same network"
+
+
 def test_head_rate_is_a_factor_on_the_layers_learning_rate(
     flights: list[Scene], options: TrainOptions, tmp_path: Path
 ) -> None:

@@ -221,7 +221,10 @@ class TrainOptions:
                 "in nontrivial mining without `same_flight` negatives."
             )
         if self.loss == CORRESPONDENCE and "netvlad" not in self.aggregation:
-            raise InputError("The correspondence loss teaches the local features of a NetVLAD.")
+            raise InputError(
+                "The correspondence loss teaches the local features of a NetVLAD, but the "
+                f"network's aggregation is {self.aggregation}; choose another loss."
+            )
         if self.loss == CORRESPONDENCE and self.teacher is not None:
             raise InputError(
                 "A teacher says how alike photos are, of which the correspondence loss knows "
