@@ -262,7 +262,7 @@ def test_a_scene_to_be_left_out_that_is_none_is_refused_with_those_there_are(
     annotated: Path, tmp_path: Path
 ) -> None:
     """A typo would train on the scene that was to be held out."""
-    with pytest.raises(InputError, match="`leave_out` names 'vilage', .*: there are village"):
+    with pytest.raises(InputError, match=r"`leave_out` names 'vilage', .*: there are village"):
         load_dataset([annotated], leave_out=["vilage"])
     arguments = ["train", str(annotated), "--output", str(tmp_path), "--leave-out", "vilage"]
     result = CliRunner().invoke(cli, arguments)

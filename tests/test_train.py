@@ -322,7 +322,7 @@ def test_a_run_begun_anew_is_taught_by_its_own_beginning(
     one, other = (tmp_path / folder / "run" for folder in ("anew", "fresh"))
     initial = (one / "initial.safetensors").read_bytes()
     assert initial == (other / "initial.safetensors").read_bytes()
-    taught = [set(path.name for path in (f / "cache").glob("teacher-*")) for f in (one, other)]
+    taught = [{path.name for path in (f / "cache").glob("teacher-*")} for f in (one, other)]
     assert taught[1] < taught[0], "both were taught by the same network"
 
 

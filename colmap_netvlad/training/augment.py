@@ -174,6 +174,7 @@ def pseudo_scene(scene: Scene, image: int, photo: Size, options: PseudoOptions) 
         method="pseudo",
         observations=seen,
         crops=crops,
+        cut_from=scene.name,
     )
 
 

@@ -86,6 +86,7 @@ class Scene:
         observations: the 3D points that each image observes, or None where not known.
         crops: (N, 3, 3) for pseudo-scenes: the homography from a photo to the view cut from it,
             in the coordinates of `augment`; None where a photo is taken whole.
+        cut_from: for pseudo-scenes: the name of the scene whose photo they are cut from.
     """
 
     name: str
@@ -101,9 +102,15 @@ class Scene:
     fingerprints: tuple[str, ...] = ()
     observations: Observations | None = None
     crops: NDArray[np.float64] | None = None
+    cut_from: str | None = None
 
     def __len__(self) -> int:
         return len(self.names)
+
+    @property
+    def origin(self) -> str:
+        """The flight: scenes of one origin may show the same ground, those of two never do."""
+        return self.cut_from or self.name
 
     @property
     def registered(self) -> int:
