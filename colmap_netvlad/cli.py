@@ -755,7 +755,8 @@ def train(
     """Train a descriptor model on annotated scenes (the paper's recipe by default).
 
     DATASETS are what `annotate` annotated. OUTPUT gets best.safetensors, to be used as
-    `--model`, the training curves, and a checkpoint that a stopped run goes on from.
+    `--model`, the training curves, and a checkpoint that a stopped run goes on from. The paper
+    shows photos as they are; here they are turned, cut and lit at random, unless `--upright 1`.
     """
     from colmap_netvlad.cli_settings import settings_of
     from colmap_netvlad.training.run import report_lines

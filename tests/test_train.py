@@ -326,6 +326,21 @@ def test_a_run_begun_anew_is_taught_by_its_own_beginning(
     assert taught[1] < taught[0], "both were taught by the same network"
 
 
+@pytest.mark.parametrize("kept", [{}, {"views": 2, "upright": 0.5}], ids=["views", "kept views"])
+def test_global_mining_describes_photos_whole_and_upright(
+    kept: dict[str, object], flights: list[Scene], options: TrainOptions, tmp_path: Path
+) -> None:
+    """Eq. 7 describes the photos, not views of them."""
+    options = change(options, mining="global", loss="triplet", aggregation="gem", **kept)
+    run = Run(flights[:2], [], options, tmp_path / "run")
+    described = run._describe_all()[1].astype(np.float32)
+    for image, found in enumerate(described):
+        pixels = run.photos.render(1, image, View(np.eye(3))).transpose(2, 0, 1)
+        with torch.inference_mode():
+            upright = run.network(torch.from_numpy(pixels.copy())[None])[0].numpy()
+        assert found @ upright > 0.999
+
+
 def test_head_rate_is_a_factor_on_the_layers_learning_rate(
     flights: list[Scene], options: TrainOptions, tmp_path: Path
 ) -> None:
@@ -558,7 +573,7 @@ def test_the_recipes_that_come_with_the_project_can_be_trained(name: str) -> Non
     TrainOptions(**read_recipe(recipes / f"{name}.toml"))
 
 
-def test_the_defaults_are_the_papers_recipe() -> None:
+def test_the_defaults_are_the_numbers_of_the_papers_recipe() -> None:
     recipe = json.loads(json.dumps(TrainOptions().as_dict()))
     paper = {
         "trunk": "vgg16",

@@ -1,6 +1,8 @@
 """Every setting of a training run, in one table: the command line and recipe files are made of it.
 
-The defaults are the paper's recipe (section 4.2). A recipe is a TOML file with these names:
+The defaults are the numbers of the paper's recipe (section 4.2); that photos are shown in views
+turned, cut and lit at random is ours, and what else departs from the paper is listed in
+docs/annotation-and-training.md. A recipe is a TOML file with these names:
 
     trunk = "vgg16"
     loss = "ranked-list"

@@ -325,14 +325,13 @@ class Run:
 
     @torch.inference_mode()
     def _describe_all(self) -> list[np.ndarray]:
-        """Describe all training photos as the network stands, for global mining."""
+        """Describe all training photos as the network stands, for global mining (eq. 7)."""
         described = []
         with progress.step("Mining hard negatives", sum(map(len, self.scenes))) as bar:
             for number, scene in enumerate(self.scenes):
                 rows = np.zeros((len(scene), self.network.network.dim), np.float16)
                 for image in range(len(scene)):
-                    one = Batch(((number, image),), ())
-                    inputs = self.inputs.batch(one, self.epoch, image).inputs
+                    inputs = self.inputs.for_mining(number, image)
                     front = self.inputs.front(self.network, inputs.to(self.device))
                     rows[image] = self.network.rest(front)[0].float().cpu().numpy()
                     bar.advance()

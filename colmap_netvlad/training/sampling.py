@@ -2,7 +2,8 @@
 
 Batched nontrivial sampling (eq. 6 and 8) needs no descriptors: B scenes, one anchor each, M of
 its positives; the other anchors' positives are its negatives. Global hard negative mining (eq. 7)
-describes all photos before each epoch and takes the nearest photos of other scenes. What is cut
+describes all photos before each epoch and takes the nearest photos of other scenes; the paper has
+one positive there (section 4.3.1), here there are M as well. What is cut
 from the photos of a flight (`augment.pseudo_scene`) is no other scene than the flight.
 
 Beside the paper's: another flight is trivially different, and telling apart photos of one flight
