@@ -757,7 +757,8 @@ def train(
     """Train a descriptor model on annotated scenes (the paper's recipe by default).
 
     DATASETS are what `annotate` annotated. OUTPUT gets best.safetensors, to be used as
-    `--model`, the training curves, and a checkpoint that a stopped run goes on from.
+    `--model`, the training curves, and a checkpoint that a stopped run goes on from. The paper
+    shows photos as they are; here they are turned, cut and lit at random, unless `--upright 1`.
     """
     from colmap_netvlad.cli_settings import settings_of
     from colmap_netvlad.training.run import report_lines
@@ -766,7 +767,7 @@ def train(
 
     options = settings_of(context, recipe)
     measured = load_dataset(validation)
-    scenes = load_dataset(datasets, (*leave_out, *(scene.name for scene in measured)))
+    scenes = load_dataset(datasets, leave_out, measured)
     report = run(scenes, measured, options, output, device=device, name=name)
     say(*report_lines(report))
     finish_partial(report.left_out)

@@ -93,7 +93,7 @@ def main(
     rotations: int,
 ) -> None:
     scenes = load_dataset(datasets)
-    training = [scene for scene in scenes if scene.name not in held_out]
+    training = load_dataset(datasets, held_out)
     validation = [scene for scene in scenes if scene.name in held_out]
     files = dict(pair.split("=", 1) for pair in weights)
     rows = []

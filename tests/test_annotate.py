@@ -253,7 +253,31 @@ def test_equal_photos_in_two_scenes_are_found_by_content(
     assert "two is left out" in report.left_out[0] and "is also" in report.left_out[0]
     with pytest.raises(InputError, match="must not be its own negative"):
         load_dataset([tmp_path / "out"])
-    assert len(load_dataset([tmp_path / "out"], leave_out=["two"])) == 1
+    (one,) = load_dataset([tmp_path / "out"], leave_out=["two"])
+    (two,) = load_dataset([tmp_path / "out"], validation=[one])
+    assert (one.name, two.name) == ("one", "two")
+
+
+def test_a_scene_to_be_left_out_that_is_none_is_refused_with_those_there_are(
+    annotated: Path, tmp_path: Path
+) -> None:
+    """A typo would train on the scene that was to be held out."""
+    with pytest.raises(InputError, match=r"`leave_out` names 'vilage', .*: there are village"):
+        load_dataset([annotated], leave_out=["vilage"])
+    arguments = ["train", str(annotated), "--output", str(tmp_path), "--leave-out", "vilage"]
+    result = CliRunner().invoke(cli, arguments)
+    assert result.exit_code == 1 and "--leave-out names 'vilage'" in result.output
+    elsewhere = dataclasses.replace(load_dataset([annotated])[0], name="elsewhere")
+    assert len(load_dataset([annotated], validation=[elsewhere])) == 1
+
+
+def test_a_missing_folder_of_databases_is_refused_before_any_work(
+    dataset: Path, tmp_path: Path
+) -> None:
+    options = AnnotateOptions(output=tmp_path / "out", databases=tmp_path / "absent")
+    with pytest.raises(InputError, match=r"matched databases .*absent does not exist"):
+        annotate([dataset], options)
+    assert not any(tmp_path.iterdir())
 
 
 def test_an_annotation_of_another_version_is_refused_and_left_alone(
@@ -344,5 +368,7 @@ def test_train_runs_from_the_command_line_on_annotations(annotated: Path, tmp_pa
     result = CliRunner().invoke(cli, arguments)
     assert result.exit_code == 1
     assert "one usable scene only (village)" in result.output
+    far = CliRunner().invoke(cli, [*arguments, "--momentum", "1.5"])
+    assert far.exit_code == 1 and "--momentum is 1.5; it must be at least 0" in far.output
     wrong = CliRunner().invoke(cli, [*arguments, "--loss", "softest"])
     assert wrong.exit_code == 2 and "'softest' is not one of" in wrong.output

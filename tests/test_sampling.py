@@ -139,7 +139,46 @@ def test_global_mining_takes_the_nearest_photos_of_other_scenes() -> None:
             for other, image in negatives:
                 distances = np.linalg.norm(descriptors[other] - descriptors[scene][anchor], axis=1)
                 assert image == distances.argmin()
-    assert len(nearest_of_other_scenes(descriptors, 0, 0)) == 3
+    origins = [scene.origin for scene in flights]
+    assert len(nearest_of_other_scenes(descriptors, origins, 0, 0)) == 3
+
+
+def with_cuts(flights: list[Scene]) -> list[Scene]:
+    """The flights, and a pseudo-scene of each of their photos."""
+    cut = PseudoOptions(views=5, seed=2)
+    return flights + [pseudo_scene(s, i, (40, 30), cut) for s in flights for i in range(len(s))]
+
+
+@pytest.mark.parametrize("mining", ["nontrivial", "global"])
+def test_a_cut_of_a_photo_is_no_negative_of_its_own_flight(mining: str) -> None:
+    """Neither of a photo of the flight, nor of another cut of it."""
+    flights = with_cuts(scenes(3))
+    rng = np.random.default_rng(0)
+    descriptors = [rng.normal(size=(len(scene), 5)) for scene in flights]
+    options = SamplingOptions(mining=mining, scenes=3, positives=1, epsilon=5, pseudo_share=0.5)
+    cuts = anchors = 0
+    for batch in Sampler(flights, options).batches(0, 20, descriptors):
+        origins = [flights[scene].origin for scene, _ in batch.samples]
+        assert len({origins[query.anchor] for query in batch.queries}) == 3
+        for query in batch.queries:
+            of_negatives = [origins[row] for row in query.negatives]
+            assert origins[query.anchor] not in of_negatives
+            assert len(of_negatives) == len(set(of_negatives)) == 2
+            anchors += 1
+            cuts += flights[batch.samples[query.anchor][0]].crops is not None
+    assert 0.3 < cuts / anchors < 0.7
+
+
+def test_a_flight_of_too_few_photos_still_gives_its_cuts_to_a_batch() -> None:
+    flights = with_cuts([strip("whole", 12), strip("tiny", 2)])
+    options = SamplingOptions(positives=2, epsilon=5, pseudo_share=0.3)
+    for batch in Sampler(flights, options).batches(0, 10):
+        assert {flights[scene].origin for scene, _ in batch.samples} == {"whole", "tiny"}
+
+
+def test_one_flight_and_its_cuts_are_one_scene() -> None:
+    with pytest.raises(InputError, match=r"one usable scene only \(scene0\)"):
+        Sampler(with_cuts(scenes(1)), SamplingOptions(positives=2, pseudo_share=0.3))
 
 
 def test_flight_batches_use_all_relations_of_many_photos_of_few_flights() -> None:

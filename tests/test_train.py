@@ -25,7 +25,7 @@ from colmap_netvlad.training import run as run_module
 from colmap_netvlad.training.augment import View
 from colmap_netvlad.training.history import Epoch, draw_curves
 from colmap_netvlad.training.inputs import KeptFeatures, Photos
-from colmap_netvlad.training.options import TrainOptions, read_recipe
+from colmap_netvlad.training.options import BOUNDS, TrainOptions, read_recipe
 from colmap_netvlad.training.run import Run, train
 from colmap_netvlad.training.scenes import Scene, symmetric
 from colmap_netvlad.training.stages import SplitNetwork, stages_of
@@ -285,6 +285,62 @@ def test_correspondences_need_to_know_where_points_are_and_take_no_teacher(
         train(flights[:2], [], change(options, teacher="start"), tmp_path / "run")
 
 
+def test_a_network_to_start_from_settles_its_kind_whatever_the_settings_say(
+    flights: list[Scene], options: TrainOptions, tmp_path: Path
+) -> None:
+    """Alpha of eq. 11, the card and the check of the loss follow the GeM, not `aggregation`."""
+    gem = change(options, aggregation="gem", views=1)
+    Run(flights[:2], [], gem, tmp_path / "gem")
+    start = TrainOptions(
+        start=str(tmp_path / "gem" / "initial.safetensors"),
+        positives=2,
+        epsilon=10,
+        width=96,
+        height=64,
+    )
+    run = Run(flights[:2], [], start, tmp_path / "run")
+    assert run.options.for_losses().alpha == 0.9
+    recipe = read_metadata(tmp_path / "run" / "initial.safetensors")["recipe"]
+    assert (recipe["aggregation"], recipe["trunk"]) == ("gem", LITE)
+    points = change(start, loss="correspondence", pseudo_views=4)
+    with pytest.raises(InputError, match="of a NetVLAD, but the network's aggregation is gem"):
+        Run(flights[:2], [], points, tmp_path / "points")
+
+
+def test_a_run_begun_anew_is_taught_by_its_own_beginning(
+    flights: list[Scene], options: TrainOptions, tmp_path: Path
+) -> None:
+    """The run before in the folder left its `initial.safetensors`."""
+    options = change(options, teacher="start", aggregation="gem", epochs=1, iterations=1)
+    train(flights[:2], [], options, tmp_path / "anew" / "run")
+    (tmp_path / "anew" / "run" / "checkpoint.pt").unlink()
+    for folder in ("anew", "fresh"):
+        netvlad = change(options, aggregation="netvlad")
+        run = Run(flights[:2], [], netvlad, tmp_path / folder / "run")
+        assert run.teacher is not None
+        assert run.teacher.similarities([(0, 0), (0, 1)]).shape == (2, 2)
+    one, other = (tmp_path / folder / "run" for folder in ("anew", "fresh"))
+    initial = (one / "initial.safetensors").read_bytes()
+    assert initial == (other / "initial.safetensors").read_bytes()
+    taught = [{path.name for path in (f / "cache").glob("teacher-*")} for f in (one, other)]
+    assert taught[1] < taught[0], "both were taught by the same network"
+
+
+@pytest.mark.parametrize("kept", [{}, {"views": 2, "upright": 0.5}], ids=["views", "kept views"])
+def test_global_mining_describes_photos_whole_and_upright(
+    kept: dict[str, object], flights: list[Scene], options: TrainOptions, tmp_path: Path
+) -> None:
+    """Eq. 7 describes the photos, not views of them."""
+    options = change(options, mining="global", loss="triplet", aggregation="gem", **kept)
+    run = Run(flights[:2], [], options, tmp_path / "run")
+    described = run._describe_all()[1].astype(np.float32)
+    for image, found in enumerate(described):
+        pixels = run.photos.render(1, image, View(np.eye(3))).transpose(2, 0, 1)
+        with torch.inference_mode():
+            upright = run.network(torch.from_numpy(pixels.copy())[None])[0].numpy()
+        assert found @ upright > 0.999
+
+
 def test_head_rate_is_a_factor_on_the_layers_learning_rate(
     flights: list[Scene], options: TrainOptions, tmp_path: Path
 ) -> None:
@@ -473,7 +529,26 @@ def test_recipes_are_read_and_checked(tmp_path: Path) -> None:
     ("settings", "said"),
     [
         ({"loss": "softest"}, "`loss` is 'softest'; it is one of ranked-list"),
-        ({"epochs": 0}, "`epochs` is 0"),
+        ({"epochs": 0}, "`epochs` is 0; it must be at least 1"),
+        ({"momentum": 1.5}, "`momentum` is 1.5; it must be at least 0 and less than 1"),
+        ({"weight_decay": -1.0}, "`weight_decay` is -1.0; it must be at least 0"),
+        ({"seed": -1}, "`seed` is -1; it must be at least 0 and at most 2147483647"),
+        ({"flight_photos": 0, "mining": "flight"}, "`flight_photos` is 0"),
+        ({"views": -1, "frozen": "conv5_2"}, "`views` is -1"),
+        ({"width": 8, "height": 8}, "`width` is 8"),
+        ({"rotation": -5.0}, "`rotation` is -5.0"),
+        ({"illumination": -1.0}, "`illumination` is -1.0"),
+        ({"warm_up": -5}, "`warm_up` is -5"),
+        ({"head_rate": -1.0}, "`head_rate` is -1.0"),
+        ({"hard_negatives": 0}, "`hard_negatives` is 0"),
+        ({"same_flight": -1}, "`same_flight` is -1"),
+        ({"upright": 3.0}, "`upright` is 3.0"),
+        ({"keep_local": -1.0}, "`keep_local` is -1.0; it must be more than 0 and at most 1"),
+        ({"alpha": -1.0}, "`alpha` is -1.0"),
+        ({"learning_rate": float("inf")}, "`learning_rate` is inf; it must be finite and more"),
+        ({"margin": float("nan")}, "`margin` is nan; it must be finite and at least 0"),
+        ({"pseudo_views": 2}, "`pseudo_views` is 2; it must be 0 or more than `positives`"),
+        ({"scenes_per_batch": 1}, "`scenes_per_batch` is 1, so that no anchor has a negative"),
         ({"scale_max": 0.1}, "below `scale_min`"),
         ({"rotations": 3}, "`rotations` is 3"),
         ({"views": 2}, "say with `frozen`"),
@@ -484,7 +559,21 @@ def test_settings_that_cannot_work_are_refused(settings: dict[str, object], said
         TrainOptions(**settings)  # type: ignore[arg-type]
 
 
-def test_the_defaults_are_the_papers_recipe() -> None:
+def test_every_number_among_the_settings_has_a_range_that_holds_its_default() -> None:
+    for item in dataclasses.fields(TrainOptions):
+        kind = item.metadata.get("type", type(item.default))
+        if kind in (int, float) and item.name != "rotations":  # which is 1 or 4
+            assert set(item.metadata) & set(BOUNDS), item.name
+    TrainOptions()
+
+
+@pytest.mark.parametrize("name", ["netvlad-o", "netvlad-o-lite", "paper"])
+def test_the_recipes_that_come_with_the_project_can_be_trained(name: str) -> None:
+    recipes = Path(__file__).parent.parent / "scripts" / "recipes"
+    TrainOptions(**read_recipe(recipes / f"{name}.toml"))
+
+
+def test_the_defaults_are_the_numbers_of_the_papers_recipe() -> None:
     recipe = json.loads(json.dumps(TrainOptions().as_dict()))
     paper = {
         "trunk": "vgg16",

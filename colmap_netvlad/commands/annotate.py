@@ -122,7 +122,8 @@ def annotate(datasets: Sequence[Path], options: AnnotateOptions) -> AnnotateRepo
     matched.
 
     Raises:
-        InputError: no scenes, or a fault that concerns them all (an unknown method, say).
+        InputError: no scenes, or a fault that concerns them all (an unknown method, say, or no
+            folder of databases).
     """
     from colmap_netvlad.mapping import MAPPERS
     from colmap_netvlad.retrieval.methods import find_method
@@ -132,6 +133,8 @@ def annotate(datasets: Sequence[Path], options: AnnotateOptions) -> AnnotateRepo
     if options.mapper not in (*MAPPERS, NO_MAPPER):
         known = ", ".join((*MAPPERS, NO_MAPPER))
         raise InputError(f"No mapper is called {options.mapper!r}: there are {known}.")
+    if options.databases is not None and not options.databases.is_dir():
+        raise InputError(f"The folder of matched databases {options.databases} does not exist.")
     for folder in find_scenes(datasets):
         logger.info("Scene %s", folder.name)
         try:

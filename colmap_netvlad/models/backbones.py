@@ -14,6 +14,7 @@ from torch import Tensor
 from colmap_netvlad.models.efficientnet_lite import EfficientNetLite0
 from colmap_netvlad.models.resnet import ResNet50
 from colmap_netvlad.models.trunk import (
+    KERAS_BGR,
     TENSORFLOW_LITE_RGB,
     TIMM_RGB,
     TORCHVISION_RGB,
@@ -141,9 +142,7 @@ BACKBONES: dict[str, Backbone] = {
 
 KNOWN_INPUTS: dict[str, Normalisation] = {
     # What a weight file may say about itself in its metadata's `input`.
-    "BGR 0..255 minus (103.939,116.779,123.68)": Normalisation(
-        "bgr", (103.939, 116.779, 123.68), (1.0, 1.0, 1.0)
-    ),
+    "BGR 0..255 minus (103.939,116.779,123.68)": KERAS_BGR,
     "RGB (x-127)/128": TENSORFLOW_LITE_RGB,
 }
 

@@ -63,14 +63,6 @@ class CameraReport:
     parameters: tuple[Parameter, ...]
     warnings: tuple[str, ...]
 
-    @property
-    def focal_change(self) -> float | None:
-        """Relative change of the focal length, or None where the first one is not known."""
-        focal = self.parameters[0]
-        if not focal.initial:
-            return None
-        return focal.adjusted / focal.initial - 1
-
 
 def camera_reports(
     model: pycolmap.Reconstruction,

@@ -1,5 +1,7 @@
 """Views of photos: any rotation, flips, scale, shift, perspective, illumination; pseudo-scenes.
 
+Ours: the paper shows each photo as it is, downsampled (section 4.2).
+
 A nadir photo has no up: flights turn, so views are turned by any angle. A view is a homography
 and an illumination, drawn from (seed, epoch, ...) alone; rendering it draws nothing, so the same
 view gives the same pixels in a resumed run.
@@ -174,6 +176,7 @@ def pseudo_scene(scene: Scene, image: int, photo: Size, options: PseudoOptions) 
         method="pseudo",
         observations=seen,
         crops=crops,
+        cut_from=scene.name,
     )
 
 

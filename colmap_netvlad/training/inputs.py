@@ -57,6 +57,9 @@ class Inputs(Protocol):
     def batch(self, batch: Batch, epoch: int, number: int) -> Drawn:
         """Return the inputs of batch `number` of an epoch; the same whenever asked for."""
 
+    def for_mining(self, scene: int, image: int) -> Tensor:
+        """Return the input (1, ...) that a photo is described by for global mining."""
+
     def front(self, network: SplitNetwork, inputs: Tensor) -> Tensor:
         """Return the frozen features of such inputs, float (N, C, h, w)."""
 
@@ -142,6 +145,10 @@ class Photos:
         rendered = [self.render(*s, view) for s, view in zip(batch.samples, views, strict=True)]
         return Drawn(_stack(rendered), np.stack([view.homography for view in views]))
 
+    def for_mining(self, scene: int, image: int) -> Tensor:
+        """Return the photo itself, whole and upright, uint8 (1, 3, H, W)."""
+        return _stack([self.render(scene, image, View(np.eye(3)))])
+
     def front(self, network: SplitNetwork, inputs: Tensor) -> Tensor:
         """See `Inputs`."""
         return network.front(inputs)
@@ -194,6 +201,15 @@ class KeptFeatures:
         homographies = [self._draw(row)[2].homography for row in rows]
         features = np.stack([self._features[row] for row in rows])
         return Drawn(torch.from_numpy(features), np.stack(homographies))
+
+    def for_mining(self, scene: int, image: int) -> Tensor:
+        """Return features of the photo's first kept view, float16 (1, C, h, w).
+
+        That is the photo itself where `upright` keeps one, else a view like the others: features
+        of whole photos would cost another run of the frozen part.
+        """
+        row = int(self._first[scene] + image) * self._views
+        return torch.from_numpy(self._features[row : row + 1].copy())
 
     def front(self, network: SplitNetwork, inputs: Tensor) -> Tensor:
         """See `Inputs`."""

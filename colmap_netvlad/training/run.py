@@ -20,7 +20,7 @@ import logging
 import math
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, astuple, dataclass, field
+from dataclasses import asdict, astuple, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -103,7 +103,7 @@ def train(
     Raises:
         InputError: a training scene is a validation scene as well or shares a photo with one,
             too few scenes, a run with other settings is in the folder, a photo is gone, the loss
-            is not a number, or the disk is full.
+            is not a number or not one for the network to start from, or the disk is full.
     """
     check_disjoint([*scenes, *validation])
     return Run(scenes, validation, options, output, Card(device, name, metadata, cache)).go()
@@ -162,7 +162,6 @@ class Run:
         card: Card | None = None,
     ) -> None:
         card = card or Card()
-        self.options = options
         self.output = output
         self.name = card.name or output.resolve().name
         self.metadata = card.metadata or {}
@@ -173,9 +172,11 @@ class Run:
         self.scenes = [*scenes, *_pseudo_scenes(scenes, options)]
         self.sampler = Sampler(self.scenes, options.for_sampling())
         self.photos = Photos(self.scenes, options)
+        network = _build(options)
+        self.options = options = _of_network(options, network)
         output.mkdir(parents=True, exist_ok=True)
         saved = self._load_checkpoint()
-        self.network = SplitNetwork(self._build(saved), options.frozen).to(self.device)
+        self.network = SplitNetwork(network, options.frozen).to(self.device)
         self.network.train(False)
         cache = card.cache or output / "cache"
         self.validation = Validation(validation, options.long_side, options.rotations, cache)
@@ -190,6 +191,7 @@ class Run:
         self.losses: list[float] = []
         if saved is None:
             self._initialise()
+            self._save_model("initial")
         self.teacher = self._teacher(cache)
         self.optimizer = self._optimizer()
         if saved is not None:
@@ -199,7 +201,6 @@ class Run:
         """Train to the last epoch."""
         options = self.options
         if not self.history:
-            self._save_model("initial")
             self._end_of_epoch(loss=math.nan)
         total = options.epochs * options.iterations
         with progress.step("Training", total) as bar:
@@ -324,14 +325,13 @@ class Run:
 
     @torch.inference_mode()
     def _describe_all(self) -> list[np.ndarray]:
-        """Describe all training photos as the network stands, for global mining."""
+        """Describe all training photos as the network stands, for global mining (eq. 7)."""
         described = []
         with progress.step("Mining hard negatives", sum(map(len, self.scenes))) as bar:
             for number, scene in enumerate(self.scenes):
                 rows = np.zeros((len(scene), self.network.network.dim), np.float16)
                 for image in range(len(scene)):
-                    one = Batch(((number, image),), ())
-                    inputs = self.inputs.batch(one, self.epoch, image).inputs
+                    inputs = self.inputs.for_mining(number, image)
                     front = self.inputs.front(self.network, inputs.to(self.device))
                     rows[image] = self.network.rest(front)[0].float().cpu().numpy()
                     bar.advance()
@@ -388,19 +388,6 @@ class Run:
 
     # Beginning and going on.
 
-    def _build(self, saved: dict[str, Any] | None) -> GlobalDescriptor:
-        options = self.options
-        if options.start is not None:
-            network = load_network(options.start)
-            network.axes = None  # they are of the features before (`scripts/make_axes.py`)
-            return network
-        trunk = load_trunk(options.trunk, Path(options.weights) if options.weights else None)
-        kind = {"kind": options.aggregation}
-        clusters = {"clusters": options.clusters} if "netvlad" in options.aggregation else {}
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(options.seed)  # hidden layers of an aggregation start at random
-            return GlobalDescriptor(trunk, build_aggregation(trunk.channels, kind | clusters))
-
     def _initialise(self) -> None:
         """Find NetVLAD's centres among local features of the training scenes (section 4.2)."""
         layer = self.network.network.aggregation
@@ -436,12 +423,8 @@ class Run:
         options = self.options
         if options.teacher is None:
             return None
-        if options.teacher == "start":
-            path = self.output / "initial.safetensors"
-            if not path.is_file():
-                self._save_model("initial")
-        else:
-            path = Path(options.teacher)
+        own = options.teacher == "start"
+        path = self.output / "initial.safetensors" if own else Path(options.teacher)
         return Teacher(load_model(path, str(self.device)), self.photos, cache)
 
     def _optimizer(self) -> torch.optim.Adam:
@@ -525,6 +508,35 @@ class Run:
         record = [(s.name, s.names, int(s.common_points.sum())) for s in self.scenes]
         text = repr((record, self.validation_scenes))
         return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _build(options: TrainOptions) -> GlobalDescriptor:
+    """Make the network that training begins with, but for NetVLAD's centres."""
+    if options.start is not None:
+        network = load_network(options.start)
+        network.axes = None  # they are of the features before (`scripts/make_axes.py`)
+        return network
+    trunk = load_trunk(options.trunk, Path(options.weights) if options.weights else None)
+    kind = {"kind": options.aggregation}
+    clusters = {"clusters": options.clusters} if "netvlad" in options.aggregation else {}
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(options.seed)  # hidden layers of an aggregation start at random
+        return GlobalDescriptor(trunk, build_aggregation(trunk.channels, kind | clusters))
+
+
+def _of_network(options: TrainOptions, network: GlobalDescriptor) -> TrainOptions:
+    """Return the settings as they are of a network: `start` settles what it is made of.
+
+    Raises:
+        InputError: the loss is not one for it.
+    """
+    layer = network.aggregation
+    return replace(
+        options,
+        trunk=network.trunk.name,
+        aggregation=layer.kind,
+        clusters=layer.options().get("clusters", options.clusters),
+    )
 
 
 def _portable(recipe: dict[str, Any]) -> dict[str, Any]:

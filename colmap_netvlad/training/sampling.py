@@ -2,7 +2,9 @@
 
 Batched nontrivial sampling (eq. 6 and 8) needs no descriptors: B scenes, one anchor each, M of
 its positives; the other anchors' positives are its negatives. Global hard negative mining (eq. 7)
-describes all photos before each epoch and takes the nearest photos of other scenes.
+describes all photos before each epoch and takes the nearest photos of other scenes; the paper has
+one positive there (section 4.3.1), here there are M as well. What is cut
+from the photos of a flight (`augment.pseudo_scene`) is no other scene than the flight.
 
 Beside the paper's: another flight is trivially different, and telling apart photos of one flight
 is the task. So an anchor can get negatives of its own flight that surely show other ground; and
@@ -49,12 +51,12 @@ class SamplingOptions:
 
     Attributes:
         mining: "nontrivial" (eq. 8), "global" (eq. 7), or "flight" (not the paper's).
-        scenes: B, the anchors of a batch, each of another scene.
+        scenes: B, the anchors of a batch, each of another flight.
         positives: M, the positives of an anchor.
         epsilon: a positive shares more than this many 3D points with its anchor (eq. 6).
         negatives: what a negative of the same flight is: "apart" (`Scene.apart`) or "unmatched"
             (`Scene.unmatched`).
-        hard_negatives: negatives of an anchor in global mining, each of another scene.
+        hard_negatives: negatives of an anchor in global mining, each of another flight.
         flight_photos: photos drawn from each scene of a flight batch.
         same_flight: further negatives of an anchor from its own flight, surely apart.
         pseudo_share: the share of anchors drawn from pseudo-scenes, 0..1.
@@ -85,8 +87,8 @@ class Sampler:
         """Find the possible anchors of each scene.
 
         Raises:
-            InputError: no scene has an anchor with enough positives, or there is one scene
-                only and no same-flight negatives were asked for.
+            InputError: no scene has an anchor with enough positives, or all that have are of
+                one flight and no same-flight negatives were asked for.
         """
         self.scenes = list(scenes)
         self.options = options
@@ -106,9 +108,13 @@ class Sampler:
                     f"Scene {scene.name} is left out: none of its {len(scene)} photos shares more "
                     f"than {options.epsilon} points with {options.positives} others."
                 )
-        self._real = [index for index in self._anchors if scenes[index].crops is None]
-        self._pseudo = [index for index in self._anchors if scenes[index].crops is not None]
         self._check()
+        self._real: dict[str, list[int]] = {}
+        self._pseudo: dict[str, list[int]] = {}
+        for index in self._anchors:
+            kind = self._real if scenes[index].crops is None else self._pseudo
+            kind.setdefault(scenes[index].origin, []).append(index)
+        self._origins = list(self._real | self._pseudo)
 
     def _check(self) -> None:
         if not self._anchors:
@@ -117,21 +123,23 @@ class Sampler:
                 f"{self.options.positives} positives with more than {self.options.epsilon} common "
                 "points. " + " ".join(self.left_out)
             )
-        if len(self._anchors) > 1:
+        origins = {self.scenes[index].origin for index in self._anchors}
+        if len(origins) > 1 or self.options.mining == "flight":
             return
-        (only,) = self._anchors
-        if self.options.mining == "flight":
-            return
+        (only,) = origins
         if self.options.mining == "global" or not self.options.same_flight:
             raise InputError(
-                f"There is one usable scene only ({self.scenes[only].name}), and negatives come "
+                f"There is one usable scene only ({only}), and negatives come "
                 "from other scenes: annotate another flight, or ask for `same_flight` negatives."
             )
-        scene = self.scenes[only]
-        self._anchors[only] = [i for i in self._anchors[only] if len(self._strangers(only, i))]
-        if not self._anchors[only]:
+        self._anchors = {
+            index: kept
+            for index, images in self._anchors.items()
+            if (kept := [image for image in images if len(self._strangers(index, image))])
+        }
+        if not self._anchors:
             raise InputError(
-                f"The one usable scene {scene.name} has no two photos that are surely apart, so "
+                f"The one usable scene {only} has no two photos that are surely apart, so "
                 "there are no negatives: annotate another flight."
             )
 
@@ -172,9 +180,10 @@ class Sampler:
     ) -> Batch:
         builder = _Builder()
         queries = []
+        origins = [scene.origin for scene in self.scenes]
         for scene in self._draw_scenes(rng):
             anchor, positives = self._draw_positives(rng, scene)
-            hardest = nearest_of_other_scenes(descriptors, scene, anchor)
+            hardest = nearest_of_other_scenes(descriptors, origins, scene, anchor)
             chosen = rng.permutation(len(hardest))[: self.options.hard_negatives]
             row = builder.add(scene, anchor)
             rows = tuple(builder.add(scene, image) for image in positives)
@@ -218,17 +227,21 @@ class Sampler:
         return one.apart(image) if self.options.negatives == "apart" else one.unmatched(image)
 
     def _draw_scenes(self, rng: np.random.Generator) -> list[int]:
-        """B scenes without repetition (fewer where there are fewer)."""
-        options = self.options
-        pseudo = int((rng.random(options.scenes) < options.pseudo_share).sum())
-        if not self._real:
-            pseudo = options.scenes
-        pseudo = min(pseudo, len(self._pseudo))
-        real = min(options.scenes - pseudo, len(self._real))
-        chosen = [self._real[i] for i in rng.permutation(len(self._real))[:real]]
-        if pseudo:
-            picks = rng.choice(len(self._pseudo), size=pseudo, replace=False)
-            chosen += [self._pseudo[i] for i in picks]
+        """B scenes of different flights (fewer where there are fewer), some of them pseudo-scenes.
+
+        A pseudo-scene shows the ground of its flight, so the two give each other no negatives.
+        """
+        pseudo = rng.random(self.options.scenes) < self.options.pseudo_share
+        left = [self._origins[i] for i in rng.permutation(len(self._origins))]
+        chosen = []
+        for is_pseudo in pseudo[: len(left)]:
+            wanted, other = self._pseudo, self._real
+            if not is_pseudo:
+                wanted, other = other, wanted
+            origin = next((origin for origin in left if origin in wanted), left[0])
+            left.remove(origin)
+            usable = wanted.get(origin) or other[origin]
+            chosen.append(usable[rng.integers(len(usable))])
         return chosen
 
     def _draw_positives(self, rng: np.random.Generator, scene: int) -> tuple[int, list[int]]:
@@ -246,21 +259,30 @@ class Sampler:
 
 
 def nearest_of_other_scenes(
-    descriptors: Sequence[NDArray[np.floating]], scene: int, image: int
+    descriptors: Sequence[NDArray[np.floating]], origins: Sequence[str], scene: int, image: int
 ) -> list[tuple[int, int]]:
-    """Return for each other scene k its photo nearest to the query: argmin ||f_q - f_n|| (eq. 7).
+    """Return for each other flight k its photo nearest to the query: argmin ||f_q - f_n|| (eq. 7).
 
     Args:
         descriptors: one (N, D) L2-normalised array a scene.
+        origins: the flight of each scene; pseudo-scenes are of the flight they are cut from.
         scene, image: the query.
+
+    Returns:
+        (scene, image), one for each flight but the query's.
     """
     query = descriptors[scene][image].astype(np.float32)
-    return [
+    nearest: dict[str, tuple[float, int, int]] = {}
+    for k, others in enumerate(descriptors):
+        if origins[k] == origins[scene] or not len(others):
+            continue
         # Of unit vectors the nearest is the one with the largest inner product.
-        (k, int(np.argmax(others @ query)))
-        for k, others in enumerate(descriptors)
-        if k != scene and len(others)
-    ]
+        products = others @ query
+        found = int(np.argmax(products))
+        best = nearest.get(origins[k])
+        if best is None or products[found] > best[0]:
+            nearest[origins[k]] = float(products[found]), k, found
+    return [(k, found) for _, k, found in nearest.values()]
 
 
 def _positives(scene: Scene, epsilon: int) -> list[NDArray[np.intp]]:

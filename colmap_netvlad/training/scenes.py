@@ -86,6 +86,7 @@ class Scene:
         observations: the 3D points that each image observes, or None where not known.
         crops: (N, 3, 3) for pseudo-scenes: the homography from a photo to the view cut from it,
             in the coordinates of `augment`; None where a photo is taken whole.
+        cut_from: for pseudo-scenes: the name of the scene whose photo they are cut from.
     """
 
     name: str
@@ -101,9 +102,15 @@ class Scene:
     fingerprints: tuple[str, ...] = ()
     observations: Observations | None = None
     crops: NDArray[np.float64] | None = None
+    cut_from: str | None = None
 
     def __len__(self) -> int:
         return len(self.names)
+
+    @property
+    def origin(self) -> str:
+        """The flight: scenes of one origin may show the same ground, those of two never do."""
+        return self.cut_from or self.name
 
     @property
     def registered(self) -> int:
@@ -263,14 +270,27 @@ def find_annotations(datasets: Iterable[Path]) -> list[Path]:
     return found
 
 
-def load_dataset(datasets: Iterable[Path], leave_out: Sequence[str] = ()) -> list[Scene]:
+def load_dataset(
+    datasets: Iterable[Path], leave_out: Sequence[str] = (), validation: Sequence[Scene] = ()
+) -> list[Scene]:
     """Load all annotated scenes of datasets, but those named in `leave_out`.
 
+    Scenes that have the name of one of `validation` are left out as well, where there are any.
+
     Raises:
-        InputError: what `load_annotation` and `check_disjoint` raise.
+        InputError: `leave_out` has a name that is no scene's, or what `load_annotation` and
+            `check_disjoint` raise.
     """
     scenes = [load_annotation(path) for path in find_annotations(datasets)]
-    kept = [scene for scene in scenes if scene.name not in leave_out]
+    known = {scene.name for scene in scenes}
+    unknown = [name for name in leave_out if name not in known]
+    if unknown:
+        raise InputError(
+            f"`leave_out` names {unknown[0]!r}, which is no scene of the datasets: there are "
+            f"{', '.join(sorted(known))}."
+        )
+    held_out = {*leave_out, *(scene.name for scene in validation)}
+    kept = [scene for scene in scenes if scene.name not in held_out]
     check_disjoint(kept)
     return kept
 

@@ -1,7 +1,8 @@
 """Roles of the photos of a batch by what their views show.
 
 A view shows a part of its photo, so two views share fewer points than their photos. GS (eq. 4)
-is counted anew over the points that both views show.
+is counted anew over the points that both views show. Ours, as views are: eq. 6 judges photos, and
+the negatives of eq. 8 are of other scenes only.
 """
 
 from __future__ import annotations
