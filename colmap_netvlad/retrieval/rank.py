@@ -89,20 +89,29 @@ def rank_project(
         return rank(flight, name, options, least_depth)
 
 
-def export_descriptors(
-    flight: Flight, name: str | Path, options: RetrievalOptions, file: Path
-) -> None:
-    """Write the global descriptors of a ranked flight in hloc's HDF5 layout.
+def check_exports(name: str | Path, options: RetrievalOptions) -> str | Path:
+    """Return the model whose descriptors `export_descriptors` writes.
 
     Raises:
-        InputError: the method has no descriptors of its own, or the file cannot be written.
+        InputError: the method has no descriptors of its own.
     """
     method = _method(name, options)
     if method.model is None:
         raise InputError(
             f"{method.name} has no deep descriptors to export; choose a method that has a model."
         )
-    hdf5.export(flight, options, options.model or method.model, file)
+    return options.model or method.model
+
+
+def export_descriptors(
+    flight: Flight, name: str | Path, options: RetrievalOptions, file: Path
+) -> None:
+    """Write the global descriptors of a ranked flight in hloc's HDF5 layout.
+
+    Raises:
+        InputError: as `check_exports`, there are none, or the file cannot be written.
+    """
+    hdf5.export(flight, options, check_exports(name, options), file)
 
 
 def _method(name: str | Path, options: RetrievalOptions) -> Method:

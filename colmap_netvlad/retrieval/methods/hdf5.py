@@ -62,7 +62,7 @@ def export(flight: Flight, options: RetrievalOptions, model: str | Path, file: P
     """Write a model's descriptors of all images that have one, float16, in hloc's layout.
 
     Raises:
-        InputError: the file cannot be written.
+        InputError: no image has one, or the file cannot be written.
     """
     import h5py
 
@@ -70,6 +70,11 @@ def export(flight: Flight, options: RetrievalOptions, model: str | Path, file: P
     key = deep.cells_key(model, options)
     known = store.described(key)
     names = [name for name in flight.names if name in known]
+    if not names:
+        raise InputError(
+            f"There is nothing to `export`: {model} has described no photo; it does where `rerank` "
+            "is above 0."
+        )
     with atomic_path(file) as temporary, h5py.File(temporary, "w") as content:
         for first in range(0, len(names), WRITE_ROWS):
             block = names[first : first + WRITE_ROWS]
