@@ -230,7 +230,12 @@ def pairs(
         print_json(as_dictionary(report))
     else:
         say(*summary(project, report))
-    finish_partial([f"Left out: {name} {reason}" for name, reason in report.ranking.left_out])
+    finish_partial(
+        [
+            *(f"Left out: {name} {reason}" for name, reason in report.ranking.left_out),
+            *(f"Ranked without the photo: {name} {why}" for name, why in report.ranking.unseen),
+        ]
+    )
 
 
 @cli.command()

@@ -14,11 +14,13 @@ from ranks import rank
 from schemas import add_images, make_database
 
 from colmap_netvlad.cache.ranking import NO_PARTNER, Ranking
+from colmap_netvlad.cache.store import Store
 from colmap_netvlad.colmap.database import image_names, open_database
+from colmap_netvlad.commands.pairs import make_pairs
 from colmap_netvlad.demo.render import RenderedFlight
 from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval import methods
-from colmap_netvlad.retrieval.methods import METHODS, bow, find_method, vlad
+from colmap_netvlad.retrieval.methods import METHODS, bow, deep, find_method, vlad
 from colmap_netvlad.retrieval.options import RetrievalOptions
 from colmap_netvlad.runtime.errors import InputError
 
@@ -155,6 +157,33 @@ def test_bad_photos_are_left_out_with_a_reason_and_stop_nothing(
     assert all(dict(ranking.left_out).values())
     assert ranking.partners.shape == (12, 8)
     assert not np.isin(ranking.partners[3:], [0, 1, 2]).any()
+
+
+@pytest.mark.parametrize("others", [False, True])
+def test_a_photo_that_is_gone_is_listed_and_not_compared_though_something_else_ranks_it(
+    others: bool, project_copy: MakeProject, checkpoint: Path, tmp_path: Path
+) -> None:
+    project = project_copy(copy_photos=True)
+    method = str(tmp_path / "others.h5") if others else "hybrid"
+    options = RetrievalOptions(k=4, model=checkpoint)
+    if others:
+        export = replace(options, rerank=1)
+        make_pairs(project, str(checkpoint), export, export=Path(method))
+    before = rank(project, method, options)
+    assert before.left_out == before.unseen == ()
+    gone, broken = image_names(project.database)[:2]
+    (project.need_images() / gone).unlink()
+    (project.need_images() / broken).write_bytes(b"")
+    with Store(project.cache) as store:
+        store._db.execute("DELETE FROM agreements")
+    after = rank(project, method, options)
+    assert after.left_out == () and (after.partners[:2] != NO_PARTNER).all()
+    assert after.unseen == ((gone, "is missing"), (broken, "is empty"))
+    with Store(project.cache) as store:
+        key = deep.cells_key(checkpoint, options)
+        numbers = {store.cell_numbers(key)[name] for name in (gone, broken)}
+        pairs, _, _ = store.agreements()
+        assert len(pairs) and not numbers & set(pairs.ravel().tolist())
 
 
 def test_no_usable_photo_at_all_is_one_sentence(

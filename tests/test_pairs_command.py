@@ -169,6 +169,19 @@ def test_bad_photos_are_listed_at_the_end_and_the_exit_code_says_so(
     assert bad not in {name for pair in colmap_list(project.pairs) for name in pair}
 
 
+def test_a_photo_that_features_alone_rank_is_listed_too(
+    project_copy: MakeProject, tiny_checkpoint: Path
+) -> None:
+    project = project_copy(copy_photos=True)
+    bad = image_names(project.database)[3]
+    (project.need_images() / bad).unlink()
+    arguments = ("--db", project.database, "--k", 3, "--method", "hybrid")
+    result = run(*arguments, "--model", tiny_checkpoint)
+    assert result.exit_code == EXIT_PARTIAL
+    assert f"Ranked without the photo: {bad} is missing" in result.stderr
+    assert bad in {name for pair in colmap_list(project.pairs) for name in pair}
+
+
 def test_every_kind_of_pixels_is_described(tmp_path: Path, tiny_checkpoint: Path) -> None:
     generator = np.random.default_rng(0)
     shapes = {

@@ -194,6 +194,7 @@ def as_json(report: PairsReport) -> dict[str, Any]:
         "seconds_search": ranking.seconds_search,
         "notes": ranking.notes,
         "left_out": [{"image": name, "reason": reason} for name, reason in ranking.left_out],
+        "unseen": [{"image": name, "reason": reason} for name, reason in ranking.unseen],
         "output": report.output,
         "colmap_list": report.colmap_list,
     }

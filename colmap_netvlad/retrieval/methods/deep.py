@@ -49,8 +49,8 @@ def candidates(
     """Rank by a model's descriptors; see `describe_photos`.
 
     A flight is described in words of its own (`retrieval.words`) unless exact or approximate
-    search by the model's descriptors is asked for. Photos that cannot be used have no partners and
-    are listed with a reason.
+    search by the model's descriptors is asked for. Photos that cannot be used are listed with a
+    reason; they have no partners but those that a ranking beside gives them.
 
     Args:
         flight: its photo folder must be known.
@@ -64,9 +64,11 @@ def candidates(
     method = Path(name_or_path).stem if Path(name_or_path).suffix else str(name_or_path)
     known = flight.store, key, flight.names, left_out, options, depth, method, [note]
     if serves(options, len(flight.names) - len(left_out)):
-        return combine([*rank_in_words(*known), *beside], method, depth)
+        return combine([*rank_in_words(*known), *beside], method, depth).with_unseen(left_out)
     alone = rank_described(*known)
-    return combine([(alone, 1.0), *beside], method, depth) if beside else alone
+    if not beside:
+        return alone
+    return combine([(alone, 1.0), *beside], method, depth).with_unseen(left_out)
 
 
 def describe_photos(
