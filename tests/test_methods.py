@@ -305,6 +305,16 @@ def test_an_unknown_method_suggests_the_nearest(name: str, hint: str) -> None:
         find_method(name)
 
 
+@pytest.mark.parametrize("seed", [-1, 2**31 - 1])
+def test_a_seed_that_cannot_be_one_is_refused(seed: int, project_copy: MakeProject) -> None:
+    with pytest.raises(InputError, match=f"`seed` is {seed}"):
+        rank(project_copy(), "random", RetrievalOptions(seed=seed))
+
+
+def test_the_highest_seed_serves_k_means(project_copy: MakeProject) -> None:
+    check_ranking(rank(project_copy(), "vlad", RetrievalOptions(k=3, seed=2**31 - 2)), 12, 3)
+
+
 def test_a_missing_checkpoint_is_said() -> None:
     with pytest.raises(InputError, match=r"none\.safetensors does not exist"):
         find_method("none.safetensors")

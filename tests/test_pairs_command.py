@@ -281,6 +281,8 @@ def test_images_that_are_connected_get_no_further_pairs(project_copy: MakeProjec
     [
         (["--k", "0"], "--k is 0"),
         (["--k", "-2"], "--k is -2"),
+        (["--seed", "-1"], "--seed"),
+        (["--seed", "99999999999"], "--seed"),
         (["--method", "vladd"], "did you mean vlad?"),
         (["--model", "none.safetensors"], "none.safetensors"),
         (["--images", "no such folder"], "no such folder"),

@@ -22,7 +22,7 @@ from colmap_netvlad.flight import Flight
 from colmap_netvlad.models.catalogue import CATALOGUE
 from colmap_netvlad.photos.decode import load_batches
 from colmap_netvlad.photos.folders import photo_folders
-from colmap_netvlad.photos.masks import find_mask
+from colmap_netvlad.photos.masks import find_mask, without_mask
 from colmap_netvlad.retrieval.described import cache_note, missing, rank_described
 from colmap_netvlad.retrieval.fusion import combine
 from colmap_netvlad.retrieval.options import RetrievalOptions
@@ -95,9 +95,10 @@ def describe_photos(
     )
     left_out |= bad
     if len(left_out) == len(names):
+        mend = "`images`" if options.masks is None else "`images` or `masks`"
         raise InputError(
             f"None of the {len(names)} photos in {folder} can be used (first: {names[0]} "
-            f"{left_out[names[0]]}); mend `images`."
+            f"{left_out[names[0]]}); mend {mend}."
         )
     return key, left_out, cache_note(len(to_do) - len(bad), len(names) - len(left_out))
 
@@ -145,6 +146,8 @@ def _contents(
     """
     photos, bad = contents(store, {name: folder / name for name in names})
     if masks is not None:
+        bad |= without_mask(masks, photos)
+        photos = {name: photo for name, photo in photos.items() if name not in bad}
         found = {name: find_mask(masks, name) for name in photos}
         files = {f"mask of {name}": mask for name, mask in found.items() if mask is not None}
         seen, unreadable = contents(store, files)
