@@ -159,6 +159,10 @@ def test_descriptors_of_others_rank_and_are_compared_place_by_place(
     names = image_names(project.database)
     vectors = hloc_file(tmp_path / "megaloc.h5", names)
     plain = rank_project(project, tmp_path / "megaloc.h5", RetrievalOptions(k=11, rerank=0))
+    hdf = (tmp_path / "megaloc.h5").rename(tmp_path / "megaloc.hdf")
+    same = rank_project(project, hdf, RetrievalOptions(k=11, rerank=0))
+    assert same.partners.tolist() == plain.partners.tolist()
+    hdf.rename(tmp_path / "megaloc.h5")
     unit = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
     cosines = unit @ unit.T
     np.fill_diagonal(cosines, -np.inf)
