@@ -147,9 +147,8 @@ def features(images: Path, database: Path, features: FeatureOptions, masks: Path
 @click.option(
     "--format",
     type=click.Choice(["colmap", "csv", "json"]),
-    default="colmap",
-    show_default=True,
-    help="COLMAP's pairs list, or with scores and ranks.",
+    help="COLMAP's pairs list, or with scores and ranks.  [default: as the name of --output ends,"
+    " else colmap]",
 )
 @click.option(
     "--output", type=PATH, help="The pairs list.  [default: pairs.txt beside the database]"
@@ -195,7 +194,7 @@ def pairs(
     method: str | None,
     descriptors: Path | None,
     retrieval: RetrievalOptions,
-    format: str,
+    format: str | None,
     output: Path | None,
     other_cameras: float,
     sequential: int,
@@ -231,7 +230,12 @@ def pairs(
         print_json(as_dictionary(report))
     else:
         say(*summary(project, report))
-    finish_partial([f"Left out: {name} {reason}" for name, reason in report.ranking.left_out])
+    finish_partial(
+        [
+            *(f"Left out: {name} {reason}" for name, reason in report.ranking.left_out),
+            *(f"Ranked without the photo: {name} {why}" for name, why in report.ranking.unseen),
+        ]
+    )
 
 
 @cli.command()

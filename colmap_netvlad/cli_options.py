@@ -15,7 +15,7 @@ import click
 from click.core import ParameterSource
 
 from colmap_netvlad.matching.options import MATCHER_DEFAULT, MatchOptions
-from colmap_netvlad.retrieval.options import COMPARED, GPS_MODES, RetrievalOptions
+from colmap_netvlad.retrieval.options import COMPARED, GPS_MODES, HIGHEST_SEED, RetrievalOptions
 from colmap_netvlad.terminal import VERBOSE
 
 if TYPE_CHECKING:
@@ -60,7 +60,11 @@ method_option = click.option(
     help="Retrieval method; `colmap-netvlad methods` lists them.",
 )
 seed_option = click.option(
-    "--seed", default=0, show_default=True, help="Seed of every random choice."
+    "--seed",
+    type=click.IntRange(0, HIGHEST_SEED),
+    default=0,
+    show_default=True,
+    help="Seed of every random choice.",
 )
 device_option = click.option(
     "--device",
@@ -70,7 +74,8 @@ device_option = click.option(
 masks_option = click.option(
     "--masks",
     type=FOLDER,
-    help="Folder of masks in COLMAP's way (<photo>.png): what is black there is ignored.",
+    help="Folder of masks in COLMAP's way (<photo>.png): what is black there is ignored, and photos"
+    " without a mask are left out.",
 )
 pairs_option = click.option(
     "--pairs",

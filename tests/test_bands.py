@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import shutil
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +14,7 @@ from click.testing import CliRunner
 from photos import scene
 from PIL import Image
 from PIL.TiffImagePlugin import ImageFileDirectory_v2
+from schemas import add_images, make_database
 
 from colmap_netvlad.cache.ranking import NO_PARTNER
 from colmap_netvlad.cli import cli
@@ -22,6 +25,8 @@ from colmap_netvlad.photos.files import read_header
 from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval.options import RetrievalOptions
 from colmap_netvlad.retrieval.rank import rank_project
+from colmap_netvlad.runtime.errors import InputError
+from colmap_netvlad.runtime.progress import Step, report_to, silent
 
 
 @pytest.mark.parametrize(
@@ -160,6 +165,28 @@ def test_the_command_pairs_same_bands_and_says_so(multispectral: Project, tmp_pa
         kinds["shot" if shot1 == shot2 else band1] += 1
     assert kinds["shot"] == 24  # each band with the colour photo of its own shot
     assert kinds["MS_G.TIF"] == kinds["MS_R.TIF"] <= kinds["D.JPG"]
+
+
+def test_one_shot_has_no_pairs(tmp_path: Path) -> None:
+    database = tmp_path / "project.db"
+    make_database(database, "4.2")
+    add_images(database, [f"IMG_0000_{band}.tif" for band in range(1, 6)])
+    with pytest.raises(InputError, match=r"All 5 images .* bands of one multispectral shot"):
+        rank_project(Project(database, None), "vlad")
+
+
+def test_looking_for_shots_is_a_step(tmp_path: Path) -> None:
+    steps: list[tuple[str, int]] = []
+
+    @contextmanager
+    def watch(title: str, total: int) -> Iterator[Step]:
+        steps.append((title, total))
+        with silent(title, total) as bar:
+            yield bar
+
+    with report_to(watch):
+        find_shots(["a.tif", "b.jpg"], tmp_path)
+    assert steps == [("Looking for multispectral shots", 2)]
 
 
 def test_exhaustive_stays_exhaustive(multispectral: Project) -> None:

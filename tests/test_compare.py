@@ -458,7 +458,7 @@ def test_a_kept_ranking_is_the_one_that_was_kept(tmp_path: Path) -> None:
     scores = np.where(partners < 0, -np.inf, 0.5).astype(np.float32)
     ranking = Ranking(
         ("a", "b", "c"), partners, scores, "hybrid", 1.5, 2.5, ("note",), (("b", "blurred"),),
-        compared=True, every_pair=True,
+        compared=True, every_pair=True, unseen=(("c", "is missing"),),
     )  # fmt: skip
     workspace.save_ranking("hybrid", ranking, True)
     kept, timed_earlier = workspace.load_ranking("hybrid") or (None, False)

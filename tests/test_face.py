@@ -159,6 +159,10 @@ def test_descriptors_of_others_rank_and_are_compared_place_by_place(
     names = image_names(project.database)
     vectors = hloc_file(tmp_path / "megaloc.h5", names)
     plain = rank_project(project, tmp_path / "megaloc.h5", RetrievalOptions(k=11, rerank=0))
+    hdf = (tmp_path / "megaloc.h5").rename(tmp_path / "megaloc.hdf")
+    same = rank_project(project, hdf, RetrievalOptions(k=11, rerank=0))
+    assert same.partners.tolist() == plain.partners.tolist()
+    hdf.rename(tmp_path / "megaloc.h5")
     unit = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
     cosines = unit @ unit.T
     np.fill_diagonal(cosines, -np.inf)
@@ -238,7 +242,19 @@ def test_ours_are_exported_as_hloc_reads_them(
 def test_a_method_without_a_model_has_nothing_to_export(
     project_copy: MakeProject, tmp_path: Path
 ) -> None:
-    file = tmp_path / "vlad.h5"
-    result = run("pairs", "--db", project_copy().database, "--method", "vlad", "--export", file)
+    project, file = project_copy(), tmp_path / "vlad.h5"
+    result = run("pairs", "--db", project.database, "--method", "vlad", "--export", file)
     assert result.exit_code == 1 and "no deep descriptors to export" in result.output
     assert not file.exists()
+    assert not project.cache.exists()  # it was refused before the work
+
+
+def test_where_no_photo_is_described_there_is_nothing_to_export(
+    project_copy: MakeProject, tmp_path: Path
+) -> None:
+    project, file = project_copy(), tmp_path / "ours.h5"
+    hloc_file(tmp_path / "others.h5", image_names(project.database))
+    others = ("--descriptors", tmp_path / "others.h5", "--rerank", 0)
+    result = run("pairs", "--db", project.database, *others, "--export", file)
+    assert result.exit_code == 1 and "nothing to --export" in result.output
+    assert not file.exists() and not project.pairs.exists()

@@ -22,6 +22,7 @@ from colmap_netvlad.pairs.rules import PartnerRules
 from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval.options import RetrievalOptions
 from colmap_netvlad.retrieval.rank import rank_project
+from colmap_netvlad.runtime.errors import InputError
 
 MakeProject = Callable[..., Project]
 
@@ -136,6 +137,23 @@ def test_photos_seen_through_masks_are_kept_beside_the_whole_ones(
     for options in (whole, masked):
         ranking = rank_project(project, tiny_checkpoint, options)
         assert ranking.notes[0].startswith("0 of 12 descriptors computed")
+
+
+def test_photos_without_a_mask_are_listed_and_a_missing_folder_is_refused(
+    project_copy: MakeProject, tiny_checkpoint: Path, tmp_path: Path
+) -> None:
+    project, masks = project_copy(), tmp_path / "masks"
+    options = RetrievalOptions(k=3, masks=masks)
+    with pytest.raises(InputError, match=r"mask folder .* does not exist; mend `masks`"):
+        rank_project(project, tiny_checkpoint, options)
+    masks.mkdir()
+    with pytest.raises(InputError, match=r"has no mask .*; mend `images` or `masks`"):
+        rank_project(project, tiny_checkpoint, options)
+    without, *others = image_names(project.database)
+    for name in others:
+        cv2.imwrite(str(masks / f"{name}.png"), np.full((60, 80), 255, np.uint8))
+    ranking = rank_project(project, tiny_checkpoint, options)
+    assert ranking.left_out == ((without, f"has no mask {masks / without}.png"),)
 
 
 def test_positions_come_from_the_database_first(project_copy: MakeProject) -> None:

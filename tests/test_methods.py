@@ -14,11 +14,13 @@ from ranks import rank
 from schemas import add_images, make_database
 
 from colmap_netvlad.cache.ranking import NO_PARTNER, Ranking
+from colmap_netvlad.cache.store import Store
 from colmap_netvlad.colmap.database import image_names, open_database
+from colmap_netvlad.commands.pairs import make_pairs
 from colmap_netvlad.demo.render import RenderedFlight
 from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval import methods
-from colmap_netvlad.retrieval.methods import METHODS, bow, find_method, vlad
+from colmap_netvlad.retrieval.methods import METHODS, bow, deep, find_method, vlad
 from colmap_netvlad.retrieval.options import RetrievalOptions
 from colmap_netvlad.runtime.errors import InputError
 
@@ -157,6 +159,33 @@ def test_bad_photos_are_left_out_with_a_reason_and_stop_nothing(
     assert not np.isin(ranking.partners[3:], [0, 1, 2]).any()
 
 
+@pytest.mark.parametrize("others", [False, True])
+def test_a_photo_that_is_gone_is_listed_and_not_compared_though_something_else_ranks_it(
+    others: bool, project_copy: MakeProject, checkpoint: Path, tmp_path: Path
+) -> None:
+    project = project_copy(copy_photos=True)
+    method = str(tmp_path / "others.h5") if others else "hybrid"
+    options = RetrievalOptions(k=4, model=checkpoint)
+    if others:
+        export = replace(options, rerank=1)
+        make_pairs(project, str(checkpoint), export, export=Path(method))
+    before = rank(project, method, options)
+    assert before.left_out == before.unseen == ()
+    gone, broken = image_names(project.database)[:2]
+    (project.need_images() / gone).unlink()
+    (project.need_images() / broken).write_bytes(b"")
+    with Store(project.cache) as store:
+        store._db.execute("DELETE FROM agreements")
+    after = rank(project, method, options)
+    assert after.left_out == () and (after.partners[:2] != NO_PARTNER).all()
+    assert after.unseen == ((gone, "is missing"), (broken, "is empty"))
+    with Store(project.cache) as store:
+        key = deep.cells_key(checkpoint, options)
+        numbers = {store.cell_numbers(key)[name] for name in (gone, broken)}
+        pairs, _, _ = store.agreements()
+        assert len(pairs) and not numbers & set(pairs.ravel().tolist())
+
+
 def test_no_usable_photo_at_all_is_one_sentence(
     project_copy: MakeProject, checkpoint: Path, tmp_path: Path
 ) -> None:
@@ -277,6 +306,16 @@ def test_k_below_one_is_refused(k: int, project_copy: MakeProject) -> None:
 def test_an_unknown_method_suggests_the_nearest(name: str, hint: str) -> None:
     with pytest.raises(InputError, match=hint):
         find_method(name)
+
+
+@pytest.mark.parametrize("seed", [-1, 2**31 - 1])
+def test_a_seed_that_cannot_be_one_is_refused(seed: int, project_copy: MakeProject) -> None:
+    with pytest.raises(InputError, match=f"`seed` is {seed}"):
+        rank(project_copy(), "random", RetrievalOptions(seed=seed))
+
+
+def test_the_highest_seed_serves_k_means(project_copy: MakeProject) -> None:
+    check_ranking(rank(project_copy(), "vlad", RetrievalOptions(k=3, seed=2**31 - 2)), 12, 3)
 
 
 def test_a_missing_checkpoint_is_said() -> None:

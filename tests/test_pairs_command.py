@@ -26,6 +26,7 @@ from colmap_netvlad.cache.ranking import NO_PARTNER, Ranking
 from colmap_netvlad.cli import cli
 from colmap_netvlad.colmap.database import image_names
 from colmap_netvlad.commands.pairs import make_pairs
+from colmap_netvlad.pairs.lists import read_pairs
 from colmap_netvlad.pairs.union import union_of_top
 from colmap_netvlad.project import Project, open_project
 from colmap_netvlad.retrieval.options import RetrievalOptions
@@ -168,6 +169,19 @@ def test_bad_photos_are_listed_at_the_end_and_the_exit_code_says_so(
     assert bad not in {name for pair in colmap_list(project.pairs) for name in pair}
 
 
+def test_a_photo_that_features_alone_rank_is_listed_too(
+    project_copy: MakeProject, tiny_checkpoint: Path
+) -> None:
+    project = project_copy(copy_photos=True)
+    bad = image_names(project.database)[3]
+    (project.need_images() / bad).unlink()
+    arguments = ("--db", project.database, "--k", 3, "--method", "hybrid")
+    result = run(*arguments, "--model", tiny_checkpoint)
+    assert result.exit_code == EXIT_PARTIAL
+    assert f"Ranked without the photo: {bad} is missing" in result.stderr
+    assert bad in {name for pair in colmap_list(project.pairs) for name in pair}
+
+
 def test_every_kind_of_pixels_is_described(tmp_path: Path, tiny_checkpoint: Path) -> None:
     generator = np.random.default_rng(0)
     shapes = {
@@ -267,6 +281,8 @@ def test_images_that_are_connected_get_no_further_pairs(project_copy: MakeProjec
     [
         (["--k", "0"], "--k is 0"),
         (["--k", "-2"], "--k is -2"),
+        (["--seed", "-1"], "--seed"),
+        (["--seed", "99999999999"], "--seed"),
         (["--method", "vladd"], "did you mean vlad?"),
         (["--model", "none.safetensors"], "none.safetensors"),
         (["--images", "no such folder"], "no such folder"),
@@ -386,13 +402,97 @@ def test_a_damaged_cache_is_said_with_the_way_out(project_copy: MakeProject) -> 
     assert "delete it" in result.output
 
 
-@pytest.mark.parametrize("option", ["--output", "--cache"])
-def test_the_users_database_is_never_overwritten(option: str, project_copy: MakeProject) -> None:
+@pytest.mark.parametrize("option", ["--output", "--cache", "--export"])
+def test_the_users_database_is_never_overwritten(
+    option: str, project_copy: MakeProject, tiny_checkpoint: Path
+) -> None:
     project = project_copy()
     before = sha256(project.database)
-    result = run("--db", project.database, "--method", "random", option, project.database)
+    result = run("--db", project.database, "--model", tiny_checkpoint, option, project.database)
     assert result.exit_code == 1
     assert sha256(project.database) == before
+
+
+def test_a_second_list_of_odd_names_overwrites_no_database(tmp_path: Path) -> None:
+    database = tmp_path / "pairs.csv"
+    make_database(database, "4.2")
+    add_images(database, ["DJI 1.jpg", "DJI 2.jpg"])
+    before = sha256(database)
+    result = run("--db", database, "--method", "random")
+    assert result.exit_code == 1 and "--output would overwrite" in result.output
+    assert sha256(database) == before
+
+
+@pytest.mark.parametrize("option", ["--output", "--export"])
+@pytest.mark.parametrize("taken", ["own.txt", "tiny.safetensors", "project.netvlad.db"])
+def test_no_file_that_is_read_is_overwritten(
+    option: str, taken: str, project_copy: MakeProject, tiny_checkpoint: Path
+) -> None:
+    project = project_copy()
+    model = shutil.copy(tiny_checkpoint, project.folder)
+    a, b = image_names(project.database)[:2]
+    own = project.folder / "own.txt"
+    own.write_text(f"{a} {b}\n")
+    before = {path: sha256(path) for path in (own, Path(model))}
+    result = run(
+        "--db", project.database, "--model", model, "--join", own, option, project.folder / taken
+    )
+    assert result.exit_code == 1 and f"{option} would overwrite" in result.output
+    assert {path: sha256(path) for path in before} == before
+
+
+def test_a_list_of_ones_own_under_the_usual_name_is_kept(project_copy: MakeProject) -> None:
+    project = project_copy()
+    a, b = image_names(project.database)[:2]
+    project.pairs.write_text(f"{a} {b}\n")
+    arguments = ("--db", project.database, "--method", "random", "--join", project.pairs)
+    result = run(*arguments)
+    assert result.exit_code == 1 and "--output would overwrite" in result.output
+    assert project.pairs.read_text() == f"{a} {b}\n"
+    assert run(*arguments, "--output", project.folder / "joined.txt").exit_code == 0
+
+
+@pytest.mark.parametrize("option", ["--output", "--export"])
+@pytest.mark.parametrize("place", ["images", "file/below.txt"])
+def test_a_file_that_cannot_be_written_is_refused_before_the_work(
+    option: str,
+    place: str,
+    project_copy: MakeProject,
+    tiny_checkpoint: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def refuse(*_: object) -> None:
+        raise AssertionError("the images were ranked")
+
+    monkeypatch.setattr("colmap_netvlad.commands.pairs.rank", refuse)
+    project = project_copy()
+    (project.folder / "file").touch()
+    result = run(
+        "--db", project.database, "--model", tiny_checkpoint, option, project.folder / place
+    )
+    assert result.exit_code == 1 and option in result.output
+    assert isinstance(result.exception, SystemExit)
+
+
+def test_one_file_is_not_both_list_and_descriptors(
+    project_copy: MakeProject, tiny_checkpoint: Path
+) -> None:
+    project = project_copy()
+    arguments = ("--db", project.database, "--model", tiny_checkpoint)
+    result = run(*arguments, "--export", project.pairs)
+    assert result.exit_code == 1 and "--export would overwrite" in result.output
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".JSON", ".txt"])
+def test_the_list_has_the_format_that_its_name_says(
+    suffix: str, project_copy: MakeProject, tmp_path: Path
+) -> None:
+    project, output = project_copy(), tmp_path / f"p{suffix}"
+    arguments = ("--db", project.database, "--method", "random", "--k", 2)
+    assert run(*arguments, "--output", output).exit_code == 0
+    assert run(*arguments).exit_code == 0
+    names = image_names(project.database)
+    assert read_pairs(output, names) == read_pairs(project.pairs, names)
 
 
 def test_the_database_of_the_current_folder_is_found(

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from colmap_netvlad.cache.cells import Cells
 from colmap_netvlad.cache.store import Store, remembered_images
 from colmap_netvlad.retrieval.described import missing
 from colmap_netvlad.runtime.errors import InputError
@@ -140,12 +141,16 @@ WRITER = """
     import sys
     from pathlib import Path
     import numpy as np
+    from colmap_netvlad.cache.cells import Cells
     from colmap_netvlad.cache.store import Store
     me = sys.argv[2]
+    cells = [Cells(np.ones((2, 2, 4), np.int8))] * 4
     with Store(Path(sys.argv[1])) as store:
         for batch in range(int(sys.argv[3])):
             names = [f"{me}-{batch}-{i}" for i in range(4)]
-            store.add_descriptors("m", names, names, np.full((4, 512), 0.5, np.float32), 0)
+            vectors = np.full((4, 512), 0.5, np.float32)
+            store.add_descriptors("m", names, names, vectors, 0, cells)
+            store.number("features", dict(zip(names, names)))
             print(batch, flush=True)
 """
 
@@ -164,6 +169,33 @@ def test_two_processes_writing_at_once_lose_nothing(cache: Path) -> None:
     with Store(cache) as store:
         assert len(store.described("m")) == 2 * 30 * 4
         assert store._db.execute("PRAGMA integrity_check").fetchone()[0] == "ok"
+
+
+def test_two_processes_that_describe_the_same_photos_leave_each_others_cells(cache: Path) -> None:
+    first = writer(cache, "same", 30)
+    assert first.stdout is not None and first.stdout.readline() == "0\n"
+    second = writer(cache, "same", 30)
+    names = [f"same-0-{i}" for i in range(4)]
+    with Store(cache) as store:
+        before = [store.cell_numbers(kind)[name] for kind in ("m", "features") for name in names]
+        for process in (first, second):
+            process.communicate(timeout=120)
+            assert process.returncode == 0
+        after = [store.cell_numbers(kind)[name] for kind in ("m", "features") for name in names]
+        assert after == before
+        assert store.read_cells(before[0]).codes.shape == (2, 2, 4)
+        assert len(store.cell_numbers("m")) == len(store.cell_numbers("features")) == 30 * 4
+
+
+def test_cells_that_another_run_replaced_are_no_damage(cache: Path) -> None:
+    cells = [Cells(np.ones((2, 2, 4), np.int8))]
+    with Store(cache) as store, Store(cache) as other:
+        store.add_descriptors("m", ["a"], ["1"], unit_vectors(1, 8), 0, cells)
+        number = store.cell_numbers("m")["a"]
+        other.add_descriptors("m", ["a"], ["changed"], unit_vectors(1, 8), 0, cells)
+        assert store.cell_numbers("m")["a"] != number
+        with pytest.raises(InputError, match=r"Another run has changed .*run the command again"):
+            store.read_cells(number)
 
 
 def test_a_new_cache_waits_for_another_process_that_makes_it_too(cache: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -29,6 +30,8 @@ class Ranking:
             empty.
         compared: whether its candidates were compared place by place (`retrieval.rerank`).
         every_pair: whether it stands for all pairs, which no k cuts.
+        unseen: (image name, reason) of photos that the deep model could not describe; they are
+            ranked by what else is known of them, and compared with nobody.
     """
 
     names: tuple[str, ...]
@@ -41,6 +44,7 @@ class Ranking:
     left_out: tuple[tuple[str, str], ...] = field(default=())
     compared: bool = False
     every_pair: bool = False
+    unseen: tuple[tuple[str, str], ...] = field(default=())
 
     def __post_init__(self) -> None:
         shape = (len(self.names), self.partners.shape[1])
@@ -49,6 +53,18 @@ class Ranking:
                 f"partners {self.partners.shape} and scores {self.scores.shape} "
                 f"do not fit {len(self.names)} images"
             )
+
+    @property
+    def not_described(self) -> frozenset[str]:
+        """Names of the images that have no cells of now: those left out, and those unseen."""
+        return frozenset(name for name, _ in (*self.left_out, *self.unseen))
+
+    def with_unseen(self, bad: Mapping[str, str]) -> Ranking:
+        """Return the ranking with the photos that could not be described (name -> reason): those
+        that are not left out are `unseen`."""
+        out = {name for name, _ in self.left_out}
+        unseen = tuple((name, reason) for name, reason in bad.items() if name not in out)
+        return replace(self, unseen=unseen)
 
     @property
     def depth(self) -> int:

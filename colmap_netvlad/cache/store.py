@@ -138,7 +138,8 @@ class Store:
         seconds: float,
         cells: Sequence[Cells] = (),
     ) -> None:
-        """Keep a batch of descriptors in one transaction; older ones of these images go.
+        """Keep a batch of descriptors in one transaction; older ones of these images go, but cells
+        of the same photo stay, and keep their number.
 
         Args:
             model: the model's fingerprint.
@@ -159,7 +160,7 @@ class Store:
             }
             for name, photo, vector in zip(names, photos, vectors, strict=True)
         )
-        codes = (
+        codes = [
             {
                 "model": model,
                 "image": name,
@@ -169,19 +170,19 @@ class Store:
                 "codes": grid.codes.tobytes(),
             }
             for name, photo, grid in zip(names, photos, cells, strict=False)
-        )
+        ]
         with self._transaction():
-            if cells and self._has_cells(model, names):
-                self._leave_orphans()
             self._db["descriptors"].insert_all(rows, replace=True)
-            self._db["cells"].insert_all(codes, replace=True)
+            self._add_cells(codes)
 
-    def _has_cells(self, model: str, names: Sequence[str]) -> bool:
-        query = "SELECT 1 FROM cells WHERE model = ? AND image = ?"
-        return any(self._db.execute(query, [model, name]).fetchone() for name in names)
-
-    def _leave_orphans(self) -> None:
-        self._db["settings"].insert({"key": ORPHANS_SETTING, "value": "1"}, replace=True)
+    def _add_cells(self, rows: Sequence[Mapping[str, object]]) -> None:
+        # Cells of the same photo stay: another run may be comparing by their number.
+        gone = self._db.conn.executemany(
+            "DELETE FROM cells WHERE model = :model AND image = :image AND photo <> :photo", rows
+        )
+        if gone.rowcount > 0:
+            self._db["settings"].insert({"key": ORPHANS_SETTING, "value": "1"}, replace=True)
+        self._db["cells"].insert_all(rows, ignore=True)
 
     def seconds(self, model: str, names: Iterable[str]) -> float:
         """Return what describing these images, which are described, took when it was done, s."""
@@ -250,22 +251,23 @@ class Store:
         ]
         if rows:
             with self._transaction():
-                if any(row["image"] in known for row in rows):
-                    self._leave_orphans()
-                self._db["cells"].insert_all(rows, replace=True)
+                self._add_cells(rows)
 
     def read_cells(self, number: int) -> Cells:
         """Return the cells of that number.
 
         Raises:
-            InputError: there are none.
+            InputError: there are none any more.
         """
         with self._faults():
             row = self._db.execute(
                 "SELECT height, width, codes FROM cells WHERE number = ?", [number]
             ).fetchone()
             if row is None:
-                raise ValueError(f"it has no cells {number}")
+                raise InputError(
+                    f"Another run has changed the cache {self.path} meanwhile; run the command "
+                    "again: what was computed is kept."
+                )
             height, width, codes = row
             return Cells(np.frombuffer(codes, np.int8).reshape(height, width, -1))
 

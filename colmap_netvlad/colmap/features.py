@@ -32,7 +32,7 @@ from colmap_netvlad.photos.files import (
 )
 from colmap_netvlad.photos.focal import plane_focal
 from colmap_netvlad.photos.folders import photo_folders
-from colmap_netvlad.photos.masks import find_mask
+from colmap_netvlad.photos.masks import check_masks, without_mask
 from colmap_netvlad.runtime import progress, workers
 from colmap_netvlad.runtime.errors import InputError
 from colmap_netvlad.runtime.jobs import Load, Source
@@ -164,8 +164,7 @@ def _check_input(images: Path, options: FeatureOptions) -> list[str]:
         raise InputError(f"`camera` is {options.camera}; choose {', '.join(CAMERA_MODES)}.")
     if options.camera_model not in pycolmap.CameraModelId.__members__:
         raise InputError(f"COLMAP has no camera model {options.camera_model}; mend `camera_model`.")
-    if options.masks is not None and not options.masks.is_dir():
-        raise InputError(f"The mask folder {options.masks} does not exist; mend `masks`.")
+    check_masks(options.masks)
     for name in ("max_image_size", "max_features", "threads"):
         value = getattr(options, name)
         if value is not None and value < 1:
@@ -215,10 +214,10 @@ def _read_headers(
 
 def _without_mask(headers: dict[str, PhotoHeader], masks: Path) -> list[tuple[str, str]]:
     """Take the photos out that have no mask; COLMAP would pass over them without a word."""
-    missing = [name for name in headers if find_mask(masks, name) is None]
+    missing = without_mask(masks, headers)
     for name in missing:
         del headers[name]
-    return [(name, f"has no mask {masks / name}.png") for name in missing]
+    return list(missing.items())
 
 
 def _group(

@@ -12,7 +12,13 @@ from colmap_netvlad.flight import open_flight
 from colmap_netvlad.graph.components import component_names, components
 from colmap_netvlad.models.catalogue import DEFAULT
 from colmap_netvlad.pairs.connect import apart_lines, connecting_budget, connecting_pairs
-from colmap_netvlad.pairs.lists import FORMATS, read_pairs, write_pairs
+from colmap_netvlad.pairs.lists import (
+    SUFFIXES,
+    format_of,
+    in_colmap_list,
+    read_pairs,
+    write_pairs,
+)
 from colmap_netvlad.pairs.rules import (
     PartnerRules,
     in_order,
@@ -31,13 +37,14 @@ from colmap_netvlad.pairs.sessions import (
 from colmap_netvlad.pairs.union import ImagePair, union_of_top
 from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval.fusion import similarity_matrix
+from colmap_netvlad.retrieval.methods import METHODS
 from colmap_netvlad.retrieval.options import RetrievalOptions
-from colmap_netvlad.retrieval.rank import export_descriptors, rank
+from colmap_netvlad.retrieval.rank import check_exports, export_descriptors, rank
 from colmap_netvlad.runtime.errors import InputError
+from colmap_netvlad.runtime.files import check_output
 from colmap_netvlad.runtime.shell import command_line
 
 NO_RULES = PartnerRules()
-SUFFIXES = {"colmap": ".txt", "csv": ".csv", "json": ".json"}
 
 
 @dataclass(frozen=True)
@@ -71,7 +78,7 @@ def make_pairs(
     project: Project,
     method: str = DEFAULT,
     options: RetrievalOptions | None = None,
-    format: str = "colmap",
+    format: str | None = None,
     output: Path | None = None,
     rules: PartnerRules = NO_RULES,
     connect: bool = True,
@@ -88,7 +95,7 @@ def make_pairs(
         project: database, photos, cache.
         method: a name in `methods.METHODS`, or a checkpoint file.
         options: k and what else a method takes.
-        format: "colmap", "csv" or "json".
+        format: "colmap", "csv" or "json"; None: as the name of `output` ends, else "colmap".
         output: the pairs list; default `pairs.txt` (.csv, .json) beside the database. Names that
             COLMAP's list cannot express (spaces, a leading #) make a second, complete list:
             the same name ending in .csv.
@@ -105,12 +112,19 @@ def make_pairs(
     options = options or RetrievalOptions()
     if k is not None:
         options = replace(options, k=k)
-    if format not in FORMATS:
-        raise InputError(f"There is no format {format!r}; formats are {', '.join(FORMATS)}.")
+    format = format or format_of(output or project.pairs)
+    if format not in SUFFIXES:
+        raise InputError(f"There is no format {format!r}; formats are {', '.join(SUFFIXES)}.")
     output = output or project.pairs.with_suffix(SUFFIXES[format])
-    _protect(output, project)
     rules.check()
+    if export is not None:
+        check_exports(method, options)
     with open_flight(project) as flight:
+        complete = _complete_list(output, format, flight.names)
+        _check_files(
+            [("output", output), ("output", complete), ("export", export)],
+            [project.database, project.cache, *_files_read(method, options, rules)],
+        )
         extra = _extra_pairs(flight.names, rules)
         sessions = find_sessions(flight.names, project.images) if rules.across else []
         ranking = rank(flight, method, options, DEPTH if rules.across else 0)
@@ -129,8 +143,8 @@ def make_pairs(
     pairs = in_order([*pairs, *links], names)
     unwritable = write_pairs(output, pairs, format)
     colmap_list = None
-    if unwritable:
-        colmap_list, output = output, output.with_suffix(".csv")
+    if unwritable and complete is not None:
+        colmap_list, output = output, complete
         write_pairs(output, pairs, "csv")
     return PairsReport(
         chosen,
@@ -180,6 +194,7 @@ def as_json(report: PairsReport) -> dict[str, Any]:
         "seconds_search": ranking.seconds_search,
         "notes": ranking.notes,
         "left_out": [{"image": name, "reason": reason} for name, reason in ranking.left_out],
+        "unseen": [{"image": name, "reason": reason} for name, reason in ranking.unseen],
         "output": report.output,
         "colmap_list": report.colmap_list,
     }
@@ -232,7 +247,34 @@ def _next_command(project: Project, report: PairsReport) -> str:
     return command_line(words)
 
 
-def _protect(output: Path, project: Project) -> None:
-    for precious in (project.database, project.cache):
-        if output.resolve() == precious.resolve():
-            raise InputError(f"`output` would overwrite {precious}; name another file.")
+def _complete_list(output: Path, format: str, names: Sequence[str]) -> Path | None:
+    """Return where a second list holds the names that COLMAP's cannot, or None."""
+    all_fit = format != "colmap" or all(map(in_colmap_list, names))
+    return None if all_fit else output.with_suffix(".csv")
+
+
+def _files_read(
+    method: str, options: RetrievalOptions, rules: PartnerRules
+) -> list[str | Path | None]:
+    by_path = None if str(method) in METHODS else method
+    return [by_path, options.model, options.vocab_tree, rules.own_pairs]
+
+
+def _check_files(
+    written: Sequence[tuple[str, Path | None]], read: Sequence[str | Path | None]
+) -> None:
+    """Make sure, before the work, that files can be written, and over none that is read or written
+    as well.
+
+    Args:
+        written: arguments and the files they name.
+    """
+    taken = {Path(file).resolve(): file for file in read if file is not None}
+    for argument, file in written:
+        if file is None:
+            continue
+        check_output(file, argument)
+        if file.resolve() in taken:
+            precious = taken[file.resolve()]
+            raise InputError(f"`{argument}` would overwrite {precious}; name another file.")
+        taken[file.resolve()] = file

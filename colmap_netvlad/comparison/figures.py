@@ -118,7 +118,11 @@ def compute_figures(
             precision = metrics.mean_average_precision(ranking.top(depth), evidence.truth)
             result = replace(
                 result,
-                notes=(*ranking.notes, *_left_out(ranking)),
+                notes=(
+                    *ranking.notes,
+                    *_some(ranking.left_out, "left out"),
+                    *_some(ranking.unseen, "ranked without the photo"),
+                ),
                 seconds_describe=ranking.seconds_describe if candidate.ranks else None,
                 seconds_search=ranking.seconds_search if candidate.ranks else None,
                 timed_earlier=candidate.timed_earlier,
@@ -166,12 +170,11 @@ def retrieval_figures(pairs: set[Pair], k: int, evidence: Evidence) -> Retrieval
     )
 
 
-def _left_out(ranking: Ranking) -> list[str]:
-    if not ranking.left_out:
+def _some(images: Sequence[tuple[str, str]], what: str) -> list[str]:
+    if not images:
         return []
-    name, reason = ranking.left_out[0]
-    count = len(ranking.left_out)
-    return [f"{count} image{'s' if count > 1 else ''} left out (first: {name}: {reason})"]
+    name, reason = images[0]
+    return [f"{len(images)} image{'s' if len(images) > 1 else ''} {what} (first: {name}: {reason})"]
 
 
 def _versions() -> dict[str, str]:

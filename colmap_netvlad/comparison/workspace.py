@@ -20,6 +20,7 @@ from contextlib import closing
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from colmap_netvlad.cache.ranking import Ranking
 from colmap_netvlad.colmap.copies import copy_database
@@ -138,9 +139,10 @@ class Workspace:
                 float(kept["seconds_describe"]),
                 float(kept["seconds_search"]),
                 tuple(kept["notes"].tolist()),
-                tuple((name, reason) for name, reason in kept["left_out"].tolist()),
+                _reasons(kept["left_out"]),
                 "compared" in kept and bool(kept["compared"]),
                 "every_pair" in kept and bool(kept["every_pair"]),
+                _reasons(kept["unseen"]) if "unseen" in kept else (),
             )
             return ranking, bool(kept["timed_earlier"])
 
@@ -159,6 +161,7 @@ class Workspace:
                 left_out=np.array(ranking.left_out, dtype=np.str_).reshape(-1, 2),
                 compared=ranking.compared,
                 every_pair=ranking.every_pair,
+                unseen=np.array(ranking.unseen, dtype=np.str_).reshape(-1, 2),
                 timed_earlier=timed_earlier,
             )
 
@@ -223,3 +226,7 @@ def file_name(key: str) -> str:
     if plain == key:
         return plain
     return f"{plain}-{hashlib.sha256(key.encode('utf-8')).hexdigest()[:8]}"
+
+
+def _reasons(kept: NDArray[np.str_]) -> tuple[tuple[str, str], ...]:
+    return tuple((name, reason) for name, reason in kept.tolist())

@@ -15,7 +15,8 @@ from colmap_netvlad.pairs.union import ImagePair
 from colmap_netvlad.runtime.errors import InputError
 from colmap_netvlad.runtime.files import write_atomically
 
-FORMATS = ("colmap", "csv", "json")
+SUFFIXES = {"colmap": ".txt", "csv": ".csv", "json": ".json"}
+"""The formats of pairs lists, and how the names of their files end."""
 
 _WORD = re.compile(r'"([^"]+)"(?=\s|$)|(\S+)')
 
@@ -32,6 +33,17 @@ def write_pairs(path: Path, pairs: Sequence[ImagePair], format: str = "colmap") 
     return unwritable
 
 
+def format_of(path: Path) -> str:
+    """Return the format that a pairs list is read in: known by its suffix, else COLMAP's."""
+    suffix = path.suffix.lower()
+    return next((format for format, own in SUFFIXES.items() if own == suffix), "colmap")
+
+
+def in_colmap_list(name: str) -> bool:
+    """Whether COLMAP's pairs list can express an image name."""
+    return not (name.startswith("#") or any(c.isspace() for c in name))
+
+
 def read_pairs(path: Path, names: Collection[str]) -> list[tuple[str, str]]:
     """Read a pairs list in any of our formats (known by its suffix, else COLMAP's).
 
@@ -45,7 +57,7 @@ def read_pairs(path: Path, names: Collection[str]) -> list[tuple[str, str]]:
     if not path.is_file():
         raise InputError(f"The pairs list {path} does not exist; `colmap-netvlad pairs` makes it.")
     try:
-        raw = _READERS.get(path.suffix.lower(), _read_colmap)(_decoded(path.read_bytes()))
+        raw = _READERS[format_of(path)](_decoded(path.read_bytes()))
     except OSError as fault:
         raise InputError(f"Cannot read {path}: {fault.strerror or fault}.") from fault
     except (ValueError, csv.Error, RecursionError) as fault:
@@ -64,15 +76,10 @@ def read_pairs(path: Path, names: Collection[str]) -> list[tuple[str, str]]:
     return list(unique.values())
 
 
-def _in_colmap_list(name: str) -> bool:
-    """Whether COLMAP's pairs list can express an image name."""
-    return not (name.startswith("#") or any(c.isspace() for c in name))
-
-
 def _colmap_text(pairs: Iterable[ImagePair]) -> tuple[str, list[str]]:
     lines, unwritable = [], set()
     for pair in pairs:
-        bad = [name for name in (pair.name1, pair.name2) if not _in_colmap_list(name)]
+        bad = [name for name in (pair.name1, pair.name2) if not in_colmap_list(name)]
         unwritable.update(bad)
         if not bad:
             lines.append(f"{pair.name1} {pair.name2}\n")
@@ -136,4 +143,4 @@ def _decoded(data: bytes) -> str:
 
 
 _TEXT = {"colmap": _colmap_text, "csv": _csv_text, "json": _json_text}
-_READERS = {".csv": _read_csv, ".json": _read_json}
+_READERS = {"colmap": _read_colmap, "csv": _read_csv, "json": _read_json}

@@ -16,6 +16,7 @@ from pathlib import Path, PurePosixPath
 import networkx as nx
 
 from colmap_netvlad.photos.files import BadPhoto, read_header
+from colmap_netvlad.runtime.progress import step
 
 RGB = "RGB"
 
@@ -118,5 +119,9 @@ def _stated(names: Sequence[str], images: Path | None) -> list[tuple[str | None,
             return None, None
         return header.exposure, header.band
 
-    with ThreadPoolExecutor() as pool:
-        return list(pool.map(read, names))
+    stated = []
+    with step("Looking for multispectral shots", len(names)) as bar, ThreadPoolExecutor() as pool:
+        for said in pool.map(read, names):
+            stated.append(said)
+            bar.advance()
+    return stated

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import cv2
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_netvlad.photos.files import BadPhoto, read_bytes
+from colmap_netvlad.runtime.errors import InputError
 
 UPRIGHT: dict[int, Callable[[np.ndarray], np.ndarray]] = {
     1: lambda stored: stored,
@@ -28,6 +29,23 @@ def find_mask(masks: Path, name: str) -> Path | None:
     """Return the mask of a photo in COLMAP's way, `<name>.png` or its stem's, or None."""
     candidates = (masks / f"{name}.png", (masks / name).with_suffix(".png"))
     return next((mask for mask in candidates if mask.is_file()), None)
+
+
+def check_masks(masks: Path | None) -> None:
+    """Make sure that a folder of masks is there, if one is named.
+
+    Raises:
+        InputError: it is not.
+    """
+    if masks is not None and not masks.is_dir():
+        raise InputError(f"The mask folder {masks} does not exist; mend `masks`.")
+
+
+def without_mask(masks: Path, names: Iterable[str]) -> dict[str, str]:
+    """Return (name -> reason) of the photos that have no mask."""
+    return {
+        name: f"has no mask {masks / name}.png" for name in names if find_mask(masks, name) is None
+    }
 
 
 def neutralise(pixels: NDArray[np.uint8], mask: Path, orientation: int = 1) -> NDArray[np.uint8]:

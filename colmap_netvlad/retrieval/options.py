@@ -21,6 +21,10 @@ SEARCH_DEPTH = 400
 does not list cannot be fused, and what none lists cannot be compared."""
 
 
+HIGHEST_SEED = 2**31 - 2
+"""faiss takes the next number, as a signed one of 32 bits."""
+
+
 def ranking_depth(k: int) -> int:
     """Return how many partners a ranking lists where each image gets `k`."""
     return max(DEPTH, DEPTH_FACTOR * k)
@@ -50,12 +54,13 @@ class RetrievalOptions:
         k: partners of each image, at least 1; some methods rank deeper.
         model: a checkpoint to use instead of the named method.
         device: where networks run; None: cuda where there is one, else cpu.
-        seed: of every random choice.
+        seed: of every random choice, 0 to `HIGHEST_SEED`.
         batch_size: photos described at once; None: the method's own.
         vocab_tree: the vocabulary tree of `bow`; None: see `bow.find_tree`.
         exact: True or False forces exact search or HNSW by the model's descriptors as they are;
             None: see `words.serves` and `search.EXACT_UP_TO`.
-        masks: folder of masks in COLMAP's way: masked areas are neutral to deep descriptors.
+        masks: folder of masks in COLMAP's way: masked areas are neutral to deep descriptors, and
+            photos without a mask are left out.
         gps: whether positions re-weight the candidates, one of `GPS_MODES`; None: "auto" where
             candidates are compared place by place, which decides, else "off".
         rerank: most candidates of each image that deep methods compare place by place

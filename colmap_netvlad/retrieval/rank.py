@@ -7,6 +7,7 @@ from pathlib import Path
 
 from colmap_netvlad.cache.ranking import Ranking
 from colmap_netvlad.flight import Flight, open_flight
+from colmap_netvlad.photos.masks import check_masks
 from colmap_netvlad.photos.positions import Positions
 from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval.bands import for_bands, multispectral_shots, of_shots
@@ -15,6 +16,7 @@ from colmap_netvlad.retrieval.gps import near_first
 from colmap_netvlad.retrieval.methods import Method, deep, find_method, hdf5
 from colmap_netvlad.retrieval.options import (
     GPS_MODES,
+    HIGHEST_SEED,
     SEARCH_DEPTH,
     RetrievalOptions,
     check_k,
@@ -44,16 +46,24 @@ def rank(
         least_depth: partners to list at least.
 
     Raises:
-        InputError: no such method, `k` below 1, fewer than two images, or what the method needs
-            is not there.
+        InputError: no such method, an option out of its range, fewer than two images, or what the
+            method needs is not there.
     """
     if options.rerank < 0:
         raise InputError(f"`rerank` is {options.rerank}; it is a number of candidates, 0 for none.")
+    if not 0 <= options.seed <= HIGHEST_SEED:
+        raise InputError(f"`seed` is {options.seed}; it is a number from 0 to {HIGHEST_SEED}.")
+    check_masks(options.masks)
     method = _method(name, options)
     # The baselines are of images: all pairs, and pairs by chance.
     shots = multispectral_shots(flight) if method.needs else None
     if shots is None:
         return _rank(flight, method, options, least_depth)
+    if len(shots.representatives) < 2:
+        raise InputError(
+            f"All {len(flight.images)} images of the database are bands of one multispectral shot; "
+            "a pair needs two. Import more photos with `colmap-netvlad features`."
+        )
     ranking = _rank(of_shots(flight, shots), method, options, least_depth)
     return for_bands(ranking, shots, flight.names)
 
@@ -89,20 +99,29 @@ def rank_project(
         return rank(flight, name, options, least_depth)
 
 
-def export_descriptors(
-    flight: Flight, name: str | Path, options: RetrievalOptions, file: Path
-) -> None:
-    """Write the global descriptors of a ranked flight in hloc's HDF5 layout.
+def check_exports(name: str | Path, options: RetrievalOptions) -> str | Path:
+    """Return the model whose descriptors `export_descriptors` writes.
 
     Raises:
-        InputError: the method has no descriptors of its own, or the file cannot be written.
+        InputError: the method has no descriptors of its own.
     """
     method = _method(name, options)
     if method.model is None:
         raise InputError(
             f"{method.name} has no deep descriptors to export; choose a method that has a model."
         )
-    hdf5.export(flight, options, options.model or method.model, file)
+    return options.model or method.model
+
+
+def export_descriptors(
+    flight: Flight, name: str | Path, options: RetrievalOptions, file: Path
+) -> None:
+    """Write the global descriptors of a ranked flight in hloc's HDF5 layout.
+
+    Raises:
+        InputError: as `check_exports`, there are none, or the file cannot be written.
+    """
+    hdf5.export(flight, options, check_exports(name, options), file)
 
 
 def _method(name: str | Path, options: RetrievalOptions) -> Method:

@@ -136,8 +136,9 @@ class _Counted:
     def __init__(
         self, store: Store, model: str, candidates: Ranking, features: LargestFeatures | None
     ) -> None:
-        left_out = {name for name, _ in candidates.left_out}
-        names = ["" if name in left_out else name for name in candidates.names]
+        # Cells of photos that are broken or gone by now may still be in the store.
+        hidden = candidates.not_described
+        names = ["" if name in hidden else name for name in candidates.names]
         known = store.agreements()  # once: a million pairs of 20,000 images
         self._places = _counts_of_places(store, known, model, names)
         self._features = (

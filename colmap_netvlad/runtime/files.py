@@ -19,6 +19,26 @@ REMOVAL_PAUSES = (0.0, 0.05, 0.2, 0.5, 1.0)
 """Before each try to remove a folder, seconds."""
 
 
+def check_output(path: Path, argument: str) -> None:
+    """Make sure, before long work, that a file can be written; nothing is made.
+
+    Args:
+        argument: what the user names the file with.
+
+    Raises:
+        InputError: it is a folder, or its folder can be neither written nor made.
+    """
+    if path.is_dir():
+        raise InputError(f"{path} is a folder; name a file with `{argument}`.")
+    # Folders that are missing are made with the file.
+    folder = next(parent for parent in path.absolute().parents if parent.exists())
+    if not folder.is_dir() or not os.access(folder, os.W_OK | os.X_OK):
+        raise InputError(
+            f"Cannot write {path}: {folder} is no folder that can be written; name a file "
+            f"elsewhere with `{argument}`."
+        )
+
+
 @contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
     """Yield a temporary name beside `path` that becomes `path` when the block succeeds.

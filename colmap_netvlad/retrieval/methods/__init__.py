@@ -15,6 +15,7 @@ from colmap_netvlad.retrieval.options import RetrievalOptions
 from colmap_netvlad.runtime.errors import InputError
 
 DESCRIPTOR_SUFFIXES = (".h5", ".hdf5")
+HDF5_START = b"\x89HDF\r\n\x1a\n"
 CHECKPOINT_SUFFIXES = (".safetensors", ".mat")
 
 
@@ -110,7 +111,7 @@ def find_method(name: str | Path) -> Method:
     if text in METHODS:
         return METHODS[text]
     path = Path(text)
-    if path.suffix in DESCRIPTOR_SUFFIXES:
+    if path.suffix in DESCRIPTOR_SUFFIXES or _is_hdf5(path):
         if not path.is_file():
             raise InputError(f"The file of descriptors {path} does not exist.")
         return _file_method(path)
@@ -120,3 +121,11 @@ def find_method(name: str | Path) -> Method:
     near = difflib.get_close_matches(text.lower(), METHODS, n=1, cutoff=0.5)
     hint = f"did you mean {near[0]}?" if near else f"methods are {', '.join(METHODS)}."
     raise InputError(f"There is no retrieval method {text!r}: {hint}")
+
+
+def _is_hdf5(path: Path) -> bool:
+    # MATLAB's own HDF5 files, which hold networks, begin otherwise.
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return file.read(len(HDF5_START)) == HDF5_START

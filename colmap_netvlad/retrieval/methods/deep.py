@@ -22,7 +22,7 @@ from colmap_netvlad.flight import Flight
 from colmap_netvlad.models.catalogue import CATALOGUE
 from colmap_netvlad.photos.decode import load_batches
 from colmap_netvlad.photos.folders import photo_folders
-from colmap_netvlad.photos.masks import find_mask
+from colmap_netvlad.photos.masks import find_mask, without_mask
 from colmap_netvlad.retrieval.described import cache_note, missing, rank_described
 from colmap_netvlad.retrieval.fusion import combine
 from colmap_netvlad.retrieval.options import RetrievalOptions
@@ -49,8 +49,8 @@ def candidates(
     """Rank by a model's descriptors; see `describe_photos`.
 
     A flight is described in words of its own (`retrieval.words`) unless exact or approximate
-    search by the model's descriptors is asked for. Photos that cannot be used have no partners and
-    are listed with a reason.
+    search by the model's descriptors is asked for. Photos that cannot be used are listed with a
+    reason; they have no partners but those that a ranking beside gives them.
 
     Args:
         flight: its photo folder must be known.
@@ -64,9 +64,11 @@ def candidates(
     method = Path(name_or_path).stem if Path(name_or_path).suffix else str(name_or_path)
     known = flight.store, key, flight.names, left_out, options, depth, method, [note]
     if serves(options, len(flight.names) - len(left_out)):
-        return combine([*rank_in_words(*known), *beside], method, depth)
+        return combine([*rank_in_words(*known), *beside], method, depth).with_unseen(left_out)
     alone = rank_described(*known)
-    return combine([(alone, 1.0), *beside], method, depth) if beside else alone
+    if not beside:
+        return alone
+    return combine([(alone, 1.0), *beside], method, depth).with_unseen(left_out)
 
 
 def describe_photos(
@@ -93,9 +95,10 @@ def describe_photos(
     )
     left_out |= bad
     if len(left_out) == len(names):
+        mend = "`images`" if options.masks is None else "`images` or `masks`"
         raise InputError(
             f"None of the {len(names)} photos in {folder} can be used (first: {names[0]} "
-            f"{left_out[names[0]]}); mend `images`."
+            f"{left_out[names[0]]}); mend {mend}."
         )
     return key, left_out, cache_note(len(to_do) - len(bad), len(names) - len(left_out))
 
@@ -143,6 +146,8 @@ def _contents(
     """
     photos, bad = contents(store, {name: folder / name for name in names})
     if masks is not None:
+        bad |= without_mask(masks, photos)
+        photos = {name: photo for name, photo in photos.items() if name not in bad}
         found = {name: find_mask(masks, name) for name in photos}
         files = {f"mask of {name}": mask for name, mask in found.items() if mask is not None}
         seen, unreadable = contents(store, files)

@@ -32,7 +32,8 @@ WRITE_ROWS = 256
 def candidates(flight: Flight, options: RetrievalOptions, depth: int, file: Path) -> Ranking:
     """Rank by the descriptors in a file; photos are described in cells to be compared.
 
-    Images that the file lacks have no candidates and are listed.
+    Images that the file lacks have no candidates and are listed, and so are photos that cannot be
+    used, which are ranked by the file alone.
 
     Args:
         options: `model` names another deep model whose cells are compared than the default.
@@ -40,8 +41,6 @@ def candidates(flight: Flight, options: RetrievalOptions, depth: int, file: Path
     Raises:
         InputError: the file is not HDF5 in hloc's layout, or of none of the images.
     """
-    if options.rerank:
-        deep.describe_photos(flight, options, options.model or DEFAULT)
     with _opened(file) as content:
         left_out = {}
         for name in flight.names:
@@ -55,14 +54,18 @@ def candidates(flight: Flight, options: RetrievalOptions, depth: int, file: Path
                 f"{flight.names[0]}); image names are relative to the photo folder."
             )
         vectors = _Rows(content, described, file)
-        return rank_vectors(vectors, flight.names, left_out, options, depth, file.stem)
+        bad: dict[str, str] = {}
+        if options.rerank:
+            _, bad, _ = deep.describe_photos(flight, options, options.model or DEFAULT)
+        ranking = rank_vectors(vectors, flight.names, left_out, options, depth, file.stem)
+        return ranking.with_unseen(bad)
 
 
 def export(flight: Flight, options: RetrievalOptions, model: str | Path, file: Path) -> None:
     """Write a model's descriptors of all images that have one, float16, in hloc's layout.
 
     Raises:
-        InputError: the file cannot be written.
+        InputError: no image has one, or the file cannot be written.
     """
     import h5py
 
@@ -70,6 +73,11 @@ def export(flight: Flight, options: RetrievalOptions, model: str | Path, file: P
     key = deep.cells_key(model, options)
     known = store.described(key)
     names = [name for name in flight.names if name in known]
+    if not names:
+        raise InputError(
+            f"There is nothing to `export`: {model} has described no photo; it does where `rerank` "
+            "is above 0."
+        )
     with atomic_path(file) as temporary, h5py.File(temporary, "w") as content:
         for first in range(0, len(names), WRITE_ROWS):
             block = names[first : first + WRITE_ROWS]
