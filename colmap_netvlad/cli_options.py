@@ -74,8 +74,7 @@ device_option = click.option(
 masks_option = click.option(
     "--masks",
     type=FOLDER,
-    help="Folder of masks in COLMAP's way (<photo>.png): what is black there is ignored, and photos"
-    " without a mask are left out.",
+    help="Folder of masks in COLMAP's way (<photo>.png): what is black there is ignored.",
 )
 pairs_option = click.option(
     "--pairs",

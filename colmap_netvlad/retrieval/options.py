@@ -59,8 +59,8 @@ class RetrievalOptions:
         vocab_tree: the vocabulary tree of `bow`; None: see `bow.find_tree`.
         exact: True or False forces exact search or HNSW by the model's descriptors as they are;
             None: see `words.serves` and `search.EXACT_UP_TO`.
-        masks: folder of masks in COLMAP's way: masked areas are neutral to deep descriptors, and
-            photos without a mask are left out.
+        masks: folder of masks in COLMAP's way: masked areas are neutral to deep descriptors;
+            photos without a mask are described whole.
         gps: whether positions re-weight the candidates, one of `GPS_MODES`; None: "auto" where
             candidates are compared place by place, which decides, else "off".
         rerank: most candidates of each image that deep methods compare place by place

@@ -62,7 +62,8 @@ def candidates(
     """
     key, left_out, note = describe_photos(flight, options, name_or_path)
     method = Path(name_or_path).stem if Path(name_or_path).suffix else str(name_or_path)
-    known = flight.store, key, flight.names, left_out, options, depth, method, [note]
+    notes = [note, *_mask_notes(options.masks, flight.names)]
+    known = flight.store, key, flight.names, left_out, options, depth, method, notes
     if serves(options, len(flight.names) - len(left_out)):
         return combine([*rank_in_words(*known), *beside], method, depth).with_unseen(left_out)
     alone = rank_described(*known)
@@ -95,12 +96,20 @@ def describe_photos(
     )
     left_out |= bad
     if len(left_out) == len(names):
-        mend = "`images`" if options.masks is None else "`images` or `masks`"
         raise InputError(
             f"None of the {len(names)} photos in {folder} can be used (first: {names[0]} "
-            f"{left_out[names[0]]}); mend {mend}."
+            f"{left_out[names[0]]}); mend `images`."
         )
     return key, left_out, cache_note(len(to_do) - len(bad), len(names) - len(left_out))
+
+
+def _mask_notes(masks: Path | None, names: Sequence[str]) -> list[str]:
+    if masks is None:
+        return []
+    bare = without_mask(masks, names)
+    if len(bare) == len(names):
+        raise InputError(f"None of the {len(names)} photos has a mask in {masks}; mend `masks`.")
+    return [f"{len(bare)} of {len(names)} photos have no mask: described whole"] if bare else []
 
 
 def _needs_cells(options: RetrievalOptions) -> bool:
@@ -146,8 +155,6 @@ def _contents(
     """
     photos, bad = contents(store, {name: folder / name for name in names})
     if masks is not None:
-        bad |= without_mask(masks, photos)
-        photos = {name: photo for name, photo in photos.items() if name not in bad}
         found = {name: find_mask(masks, name) for name in photos}
         files = {f"mask of {name}": mask for name, mask in found.items() if mask is not None}
         seen, unreadable = contents(store, files)
