@@ -281,6 +281,30 @@ def test_frames_and_systems_there_and_back(latitude: float) -> None:
     assert frame.from_wgs84(frame.to_wgs84(places)) == pytest.approx(places, abs=1e-6)
 
 
+FOOT = 1200 / 3937
+"""m of a US survey foot."""
+
+
+@pytest.mark.parametrize(
+    ("system", "metres"),
+    [
+        ("EPSG:2263", FOOT),
+        ("EPSG:2263+6360", FOOT),
+        ("EPSG:2263+5703", 1.0),
+        ("EPSG:32618", 1.0),
+        ("EPSG:4326", 1.0),
+    ],
+)
+def test_heights_are_in_the_unit_of_the_system(system: str, metres: float) -> None:
+    frame, crs = LocalFrame(40.8, -73.1), CRS.from_user_input(system)
+    places = np.array([[0.0, 0.0, 30.0], [200.0, -100.0, 0.0]])
+    there = frame.to_crs(places, crs)
+    assert there[0, 2] == pytest.approx(30 / metres, abs=1e-6)
+    assert frame.from_crs(there, crs) == pytest.approx(places, abs=1e-4)
+    plain = Transformer.from_crs(4326, CRS.from_user_input(system.split("+")[0]), always_xy=True)
+    assert there[0, :2] == pytest.approx(plain.transform(-73.1, 40.8), abs=1e-6)
+
+
 def test_outlines_do_not_go_around_the_globe(exported: Exported) -> None:
     model = pycolmap.Reconstruction(exported.folder / "sparse/0")
     world = World(model, LocalFrame(-17.0, 179.9999), CRS.from_epsg(32760))

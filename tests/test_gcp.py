@@ -82,6 +82,21 @@ def test_control_places_the_model_better_than_gps(controlled: Controlled, tmp_pa
     assert_in_place(controlled, tmp_path / "out")
 
 
+def test_a_list_in_feet_is_in_feet_in_height_too(controlled: Controlled, tmp_path: Path) -> None:
+    lines = controlled.list.read_text().splitlines()[1:]
+    rows = [line.split() for line in lines]
+    feet = [[str(float(value) * 3937 / 1200) for value in row[:3]] + row[3:] for row in rows]
+    system = "+proj=utm +zone=30 +datum=WGS84 +units=us-ft"
+    list_in_feet = tmp_path / "feet.txt"
+    list_in_feet.write_text("\n".join([system, *map(" ".join, feet)]) + "\n")
+    result = georegister(controlled, list_in_feet, tmp_path / "out")
+    assert result.exit_code == 0, result.output
+    assert f"Heights in feet.txt are read in the unit of {system}, US survey foot" in result.output
+    assert_in_place(controlled, tmp_path / "out")
+    places = [read_control(path, controlled.truth) for path in (controlled.list, list_in_feet)]
+    assert places[1].geographic() == pytest.approx(places[0].geographic(), abs=1e-3)
+
+
 def test_the_adjustment_holds_the_points(controlled: Controlled, tmp_path: Path) -> None:
     from colmap_netvlad.geo.gcp import adjust_to_control, align_to_control, measure_control
 
