@@ -15,7 +15,7 @@ from colmap_netvlad.export.world import World
 from colmap_netvlad.geo.frames import read_crs
 from colmap_netvlad.geo.georeference import read_frame
 from colmap_netvlad.graph.verified import verified_by_name
-from colmap_netvlad.mapping.output import free_output, model_folder
+from colmap_netvlad.mapping.output import free_output, model_folder, named
 from colmap_netvlad.runtime.errors import InputError
 
 
@@ -54,6 +54,7 @@ def export(
         InputError: no model, one that is not in the world for a format that needs it, an unknown
             or unprojected system, or `output` holds something already.
     """
+    sparse = named(sparse)
     folders = find_models(sparse)
     formats = formats or (*FORMATS, *PLAIN)
     projected = None if crs is None else _projected(crs)
@@ -61,7 +62,7 @@ def export(
     frames = {
         folder: read_frame(folder) for folder in folders if any(name in FORMATS for name in formats)
     }
-    output = output or free_output(sparse.with_name(f"{sparse.resolve().name}-export"))
+    output = output or free_output(sparse.with_name(f"{sparse.name}-export"))
     name = None
     with model_folder(output) as temporary:
         for folder in folders:
