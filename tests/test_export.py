@@ -272,6 +272,15 @@ def test_a_photo_to_the_horizon_has_no_footprint(exported: Exported) -> None:
     assert footprint(model, image) is None
 
 
+def test_a_lens_without_rays_in_the_corners_has_no_footprint(exported: Exported) -> None:
+    model = pycolmap.Reconstruction(exported.folder / "sparse/0")
+    image = model.image(model.reg_image_ids()[0])
+    camera = model.camera(image.camera_id)
+    camera.params = [*camera.params[:3], -1.2]  # an action camera's k1
+    assert np.isnan(camera.cam_from_img([[0.0, 0.0]])).all()
+    assert footprint(model, image) is None
+
+
 @pytest.mark.parametrize("latitude", [-33.9, 0.0, 61.0])
 def test_frames_and_systems_there_and_back(latitude: float) -> None:
     frame = LocalFrame(latitude, 18.4)
