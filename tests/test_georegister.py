@@ -268,9 +268,7 @@ def test_no_model_is_one_sentence(tmp_path: Path, what: str) -> None:
     assert ("damaged" if what == "damaged" else "holds no COLMAP model") in said
 
 
-def test_positions_of_the_folder_above_are_another_flights(
-    mapped: Mapped, tmp_path: Path
-) -> None:
+def test_positions_of_the_folder_above_are_another_flights(mapped: Mapped, tmp_path: Path) -> None:
     """Drones name the photos of every flight alike."""
     shutil.copytree(mapped.folder / "sparse", tmp_path / "flight/sparse")
     shutil.copy(mapped.folder / "database.db", tmp_path / "project.db")

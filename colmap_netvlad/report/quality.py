@@ -460,9 +460,13 @@ def within(graph: ViewGraph, inside: Collection[str], left_out: Collection[Pair]
     """Return the part of a view graph that lies within some of its images, without some pairs."""
     kept = np.array([name in inside for name in graph.names], bool)
     place = np.cumsum(kept) - 1
-    both = kept[graph.edges].all(axis=1) if len(graph.edges) else np.zeros(0, bool)
-    for edge, (i, j) in enumerate(graph.edges.tolist()):
-        both[edge] &= as_pair(graph.names[i], graph.names[j]) not in left_out
+    both = np.array(
+        [
+            bool(kept[i] and kept[j]) and as_pair(graph.names[i], graph.names[j]) not in left_out
+            for i, j in graph.edges.tolist()
+        ],
+        bool,
+    )
     return ViewGraph(
         tuple(name for name in graph.names if name in inside),
         place[graph.edges[both]].astype(np.int32).reshape(-1, 2),
