@@ -6,6 +6,7 @@ import csv
 import json
 import math
 import shutil
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +15,7 @@ import pycolmap
 import pytest
 from click.testing import CliRunner, Result
 from pyproj import CRS, Proj, Transformer
+from pyproj.transformer import TransformerGroup
 
 from colmap_netvlad.cli import cli
 from colmap_netvlad.colmap.database import image_names
@@ -223,6 +225,15 @@ def test_another_system(exported: Exported, tmp_path: Path) -> None:
     latitude, longitude, _ = FRAME.to_wgs84(exported.truth[row["name"]][None])[0]
     east, north = Transformer.from_crs(4326, 27700, always_xy=True).transform(longitude, latitude)
     assert math.hypot(float(row["easting"]) - east, float(row["northing"]) - north) < 0.2
+    said = "OSGB36 / British National Grid is good to 2 m: PROJ lacks uk_os_OSTN15"
+    assert (said in result.output) != finds_all_grids("EPSG:27700")
+    assert "PROJ" not in exported.said  # UTM needs no grid
+
+
+def finds_all_grids(system: str) -> bool:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return TransformerGroup("EPSG:4326", system).best_available
 
 
 def test_ten_models_have_a_folder_each(exported: Exported, tmp_path: Path) -> None:

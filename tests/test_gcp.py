@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +13,7 @@ import numpy as np
 import pycolmap
 import pytest
 from click.testing import CliRunner, Result
+from pyproj.transformer import TransformerGroup
 
 from colmap_netvlad.cli import cli
 from colmap_netvlad.demo.simulate import (
@@ -222,6 +224,15 @@ def test_photos_may_have_spaces_and_umlauts_and_folders(tmp_path: Path, joint: s
     assert [mark.photo for mark in control.points[0].marks] == photos[:2]
     assert control.points[1].marks[0].photo == "b/x.jpg"
     assert control.geographic()[0] == pytest.approx([48.2, 7.1, 300], abs=1e-6)
+
+
+def test_what_a_list_loses_without_grids_is_said(tmp_path: Path) -> None:
+    path = tmp_path / "gcp.txt"
+    path.write_text("EPSG:27700\n435300 387300 90 10 20 a.jpg\n")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        all_there = TransformerGroup("EPSG:4326", "EPSG:27700").best_available
+    assert ("is good to 2 m" in " ".join(read_control(path, ["a.jpg"]).notes)) != all_there
 
 
 def test_a_list_that_is_no_text(tmp_path: Path) -> None:

@@ -7,14 +7,18 @@ ellipsoid; every conversion here is exact, and takes account of it.
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from pyproj import CRS, Transformer
+from pyproj.aoi import AreaOfInterest
 from pyproj.enums import TransformDirection
 from pyproj.exceptions import CRSError
+from pyproj.transformer import TransformerGroup
 
 from colmap_netvlad.photos.positions import middle_of
 from colmap_netvlad.runtime.errors import InputError
@@ -117,6 +121,32 @@ def height_unit(crs: CRS) -> tuple[str, float]:
     if len(crs.axis_info) == 2 and crs.is_geographic:
         return "metre", 1.0
     return axis.unit_name, axis.unit_conversion_factor
+
+
+def lacking_grids(crs: CRS, geographic: Array) -> list[str]:
+    """Return a sentence where PROJ has not the grids of the best transformation to a system.
+
+    It takes the best it has without a word, which is good to some m in many national systems.
+
+    Args:
+        geographic: (N, 3) latitude, longitude (degrees), height of places for which it counts.
+    """
+    latitude, longitude, _ = np.median(geographic, axis=0).tolist()
+    if not np.isfinite([latitude, longitude]).all():
+        return []
+    near: Any = AreaOfInterest(longitude, latitude, longitude, latitude)  # not as stubs have it
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of what is said here
+        group = TransformerGroup("EPSG:4326", crs.to_2d(), always_xy=True, area_of_interest=near)
+    if group.best_available or not group.transformers:
+        return []
+    accuracy = group.transformers[0].accuracy
+    good = f"good to {accuracy:g} m" if accuracy >= 0 else "of unknown accuracy"
+    files = ", ".join(grid.short_name for grid in group.unavailable_operations[0].grids)
+    return [
+        f"The transformation between WGS84 and {crs.name} is {good}: PROJ lacks {files} for a "
+        "better one (`pyproj sync` fetches its grids)."
+    ]
 
 
 def read_crs(text: str) -> CRS:

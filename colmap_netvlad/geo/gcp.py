@@ -16,7 +16,7 @@ from pyproj import CRS
 from scipy.optimize import least_squares
 
 from colmap_netvlad.geo.align import MIN_PLACES, NotAligned
-from colmap_netvlad.geo.frames import LocalFrame, height_unit, read_crs
+from colmap_netvlad.geo.frames import LocalFrame, height_unit, lacking_grids, read_crs
 from colmap_netvlad.runtime.errors import InputError
 
 Array = NDArray[np.float64]
@@ -191,6 +191,7 @@ def read_control(path: Path, photos: Collection[str], check: Collection[str] = (
         GroundPoint(name, place, tuple(marks), name in check)
         for name, place, marks in found.values()
     )
+    notes += lacking_grids(crs, ControlList(crs, points).geographic())
     return ControlList(crs, points, tuple(notes))
 
 
