@@ -433,10 +433,12 @@ def georegister(
     points, and written to a new folder, with georeference.json (origin, EPSG code of the UTM zone,
     transform, residuals) in it. A database is not needed: the photos' GPS is enough.
     """
-    from colmap_netvlad.commands.georegister import beside, report_lines
+    from colmap_netvlad.commands.georegister import database_beside, images_beside, report_lines
     from colmap_netvlad.commands.georegister import georegister as run
 
-    database, images = beside(sparse, database, images)
+    database, of_database = database_beside(sparse, database)
+    images, of_images = images_beside(sparse, images)
+    say(*of_database, *of_images)
     report = run(sparse, output, database, images, gcp, seed)
     say(*report_lines(report))
     finish_partial(
@@ -475,9 +477,11 @@ def export(
     """
     from colmap_netvlad.commands.export import export as run
     from colmap_netvlad.commands.export import report_lines
-    from colmap_netvlad.commands.georegister import beside
+    from colmap_netvlad.commands.georegister import database_beside
 
-    say(*report_lines(run(sparse, formats, output, beside(sparse, database, None)[0], crs)))
+    database, of_database = database_beside(sparse, database)
+    say(*of_database)
+    say(*report_lines(run(sparse, formats, output, database, crs)))
 
 
 @cli.command()

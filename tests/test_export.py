@@ -6,6 +6,7 @@ import csv
 import json
 import math
 import shutil
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +15,7 @@ import pycolmap
 import pytest
 from click.testing import CliRunner, Result
 from pyproj import CRS, Proj, Transformer
+from pyproj.transformer import TransformerGroup
 
 from colmap_netvlad.cli import cli
 from colmap_netvlad.colmap.database import image_names
@@ -223,6 +225,15 @@ def test_another_system(exported: Exported, tmp_path: Path) -> None:
     latitude, longitude, _ = FRAME.to_wgs84(exported.truth[row["name"]][None])[0]
     east, north = Transformer.from_crs(4326, 27700, always_xy=True).transform(longitude, latitude)
     assert math.hypot(float(row["easting"]) - east, float(row["northing"]) - north) < 0.2
+    said = "OSGB36 / British National Grid is good to 2 m: PROJ lacks uk_os_OSTN15"
+    assert (said in result.output) != finds_all_grids("EPSG:27700")
+    assert "PROJ" not in exported.said  # UTM needs no grid
+
+
+def finds_all_grids(system: str) -> bool:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return TransformerGroup("EPSG:4326", system).best_available
 
 
 def test_ten_models_have_a_folder_each(exported: Exported, tmp_path: Path) -> None:
@@ -272,6 +283,15 @@ def test_a_photo_to_the_horizon_has_no_footprint(exported: Exported) -> None:
     assert footprint(model, image) is None
 
 
+def test_a_lens_without_rays_in_the_corners_has_no_footprint(exported: Exported) -> None:
+    model = pycolmap.Reconstruction(exported.folder / "sparse/0")
+    image = model.image(model.reg_image_ids()[0])
+    camera = model.camera(image.camera_id)
+    camera.params = [*camera.params[:3], -1.2]  # an action camera's k1
+    assert np.isnan(camera.cam_from_img([[0.0, 0.0]])).all()
+    assert footprint(model, image) is None
+
+
 @pytest.mark.parametrize("latitude", [-33.9, 0.0, 61.0])
 def test_frames_and_systems_there_and_back(latitude: float) -> None:
     frame = LocalFrame(latitude, 18.4)
@@ -279,6 +299,30 @@ def test_frames_and_systems_there_and_back(latitude: float) -> None:
     system = CRS.from_epsg(frame.epsg)
     assert frame.from_crs(frame.to_crs(places, system), system) == pytest.approx(places, abs=1e-4)
     assert frame.from_wgs84(frame.to_wgs84(places)) == pytest.approx(places, abs=1e-6)
+
+
+FOOT = 1200 / 3937
+"""m of a US survey foot."""
+
+
+@pytest.mark.parametrize(
+    ("system", "metres"),
+    [
+        ("EPSG:2263", FOOT),
+        ("EPSG:2263+6360", FOOT),
+        ("EPSG:2263+5703", 1.0),
+        ("EPSG:32618", 1.0),
+        ("EPSG:4326", 1.0),
+    ],
+)
+def test_heights_are_in_the_unit_of_the_system(system: str, metres: float) -> None:
+    frame, crs = LocalFrame(40.8, -73.1), CRS.from_user_input(system)
+    places = np.array([[0.0, 0.0, 30.0], [200.0, -100.0, 0.0]])
+    there = frame.to_crs(places, crs)
+    assert there[0, 2] == pytest.approx(30 / metres, abs=1e-6)
+    assert frame.from_crs(there, crs) == pytest.approx(places, abs=1e-4)
+    plain = Transformer.from_crs(4326, CRS.from_user_input(system.split("+")[0]), always_xy=True)
+    assert there[0, :2] == pytest.approx(plain.transform(-73.1, 40.8), abs=1e-6)
 
 
 def test_outlines_do_not_go_around_the_globe(exported: Exported) -> None:

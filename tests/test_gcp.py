@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +13,7 @@ import numpy as np
 import pycolmap
 import pytest
 from click.testing import CliRunner, Result
+from pyproj.transformer import TransformerGroup
 
 from colmap_netvlad.cli import cli
 from colmap_netvlad.demo.simulate import (
@@ -80,6 +82,21 @@ def test_control_places_the_model_better_than_gps(controlled: Controlled, tmp_pa
     assert [name for name, one in told["points"].items() if one["check"]] == ["GCP5", "GCP8"]
     assert all(one["pixels"] < 1.5 for one in told["points"].values())
     assert_in_place(controlled, tmp_path / "out")
+
+
+def test_a_list_in_feet_is_in_feet_in_height_too(controlled: Controlled, tmp_path: Path) -> None:
+    lines = controlled.list.read_text().splitlines()[1:]
+    rows = [line.split() for line in lines]
+    feet = [[str(float(value) * 3937 / 1200) for value in row[:3]] + row[3:] for row in rows]
+    system = "+proj=utm +zone=30 +datum=WGS84 +units=us-ft"
+    list_in_feet = tmp_path / "feet.txt"
+    list_in_feet.write_text("\n".join([system, *map(" ".join, feet)]) + "\n")
+    result = georegister(controlled, list_in_feet, tmp_path / "out")
+    assert result.exit_code == 0, result.output
+    assert f"Heights in feet.txt are read in the unit of {system}, US survey foot" in result.output
+    assert_in_place(controlled, tmp_path / "out")
+    places = [read_control(path, controlled.truth) for path in (controlled.list, list_in_feet)]
+    assert places[1].geographic() == pytest.approx(places[0].geographic(), abs=1e-3)
 
 
 def test_the_adjustment_holds_the_points(controlled: Controlled, tmp_path: Path) -> None:
@@ -207,6 +224,15 @@ def test_photos_may_have_spaces_and_umlauts_and_folders(tmp_path: Path, joint: s
     assert [mark.photo for mark in control.points[0].marks] == photos[:2]
     assert control.points[1].marks[0].photo == "b/x.jpg"
     assert control.geographic()[0] == pytest.approx([48.2, 7.1, 300], abs=1e-6)
+
+
+def test_what_a_list_loses_without_grids_is_said(tmp_path: Path) -> None:
+    path = tmp_path / "gcp.txt"
+    path.write_text("EPSG:27700\n435300 387300 90 10 20 a.jpg\n")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        all_there = TransformerGroup("EPSG:4326", "EPSG:27700").best_available
+    assert ("is good to 2 m" in " ".join(read_control(path, ["a.jpg"]).notes)) != all_there
 
 
 def test_a_list_that_is_no_text(tmp_path: Path) -> None:

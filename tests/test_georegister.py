@@ -268,6 +268,53 @@ def test_no_model_is_one_sentence(tmp_path: Path, what: str) -> None:
     assert ("damaged" if what == "damaged" else "holds no COLMAP model") in said
 
 
+def test_positions_of_the_folder_above_are_another_flights(mapped: Mapped, tmp_path: Path) -> None:
+    """Drones name the photos of every flight alike."""
+    shutil.copytree(mapped.folder / "sparse", tmp_path / "flight/sparse")
+    shutil.copy(mapped.folder / "database.db", tmp_path / "project.db")
+    (tmp_path / "images").mkdir()
+    said = sentence(run("georegister", "--sparse", tmp_path / "flight/sparse"))
+    assert "No position is known" in said and "project.db" not in said
+    for name in ("project.db", "images"):
+        (tmp_path / name).rename(tmp_path / "flight" / name)
+    for sparse in ("sparse", "sparse/0"):
+        result = run("georegister", "--sparse", tmp_path / "flight" / sparse)
+        assert f"Database, found beside the model: {tmp_path}/flight/project.db." in result.output
+        assert f"Photos, found beside the model: {tmp_path}/flight/images." in result.output
+    exported = run("export", "--sparse", tmp_path / "flight/sparse/0-georegistered")
+    assert "Database, found beside the model" in exported.output
+
+
+def test_a_database_of_other_features_is_used_only_where_it_is_named(
+    mapped: Mapped, tmp_path: Path
+) -> None:
+    shutil.copytree(mapped.folder, tmp_path, dirs_exist_ok=True)
+    database = tmp_path / "database.db"
+    with closing(sqlite3.connect(database)) as opened:
+        opened.execute("UPDATE keypoints SET rows = 0, data = x'' WHERE image_id = 3")
+        opened.commit()
+    said = sentence(run("georegister", "--sparse", tmp_path / "sparse"))
+    assert f"{database} is put aside: its photos have other features than the model's" in said
+    assert "name it as --db" in said and "No position is known" in said
+    assert run("georegister", "--sparse", tmp_path / "sparse", "--db", database).exit_code == 0
+
+
+@pytest.mark.parametrize(("given", "name"), [(".", "0"), ("..", "sparse")])
+def test_the_folder_one_stands_in(
+    mapped: Mapped, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, given: str, name: str
+) -> None:
+    shutil.copytree(mapped.folder, tmp_path, dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path / "sparse/0")
+    result = run("georegister", "--sparse", given)
+    assert result.exit_code == 0, result.output
+    assert "0: Georegistered in m" in result.output
+    written = Path.cwd().parent if given == "." else tmp_path
+    assert (written / f"{name}-georegistered").is_dir()
+    monkeypatch.chdir(next(written.glob("*-georegistered")))
+    assert run("export", "--sparse", ".", "--format", "csv").exit_code == 0
+    assert (written / f"{name}-georegistered-export").is_dir()
+
+
 def matched_project(mapped: Mapped, folder: Path) -> Path:
     shutil.copy(mapped.folder / "database.db", folder / "database.db")
     names = list(mapped.truth)

@@ -12,6 +12,7 @@ from colmap_netvlad.mapping.merge import (
     SubModel,
     join,
     merge,
+    seen_once,
     shared_points,
     similarity,
 )
@@ -168,3 +169,14 @@ def test_similarity_is_found_for_any_scale_in_spite_of_outliers(scale, seed, out
     b.xyz[wrong] = b.xyz[wrong][rng.permutation(wrong.sum())]
     joined = join(a, b)
     assert centre(joined, 6) == pytest.approx([60, 0, -100], abs=0.2)
+
+
+@pytest.mark.parametrize("kind", [np.int32, np.int64])
+def test_an_image_sees_a_point_once_the_first_time(kind: type[np.integer]) -> None:
+    rng = np.random.default_rng(0)
+    owner, image = rng.integers(0, 40, 2000).astype(kind), rng.integers(2**31 - 30, 2**31, 2000)
+    keys = image << 32 | np.arange(2000)
+    first: dict[tuple[int, int], int] = {}
+    for row, seen in enumerate(zip(owner.tolist(), image.tolist(), strict=True)):
+        first.setdefault(seen, row)
+    assert seen_once(keys, owner).tolist() == list(first.values())

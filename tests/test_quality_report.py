@@ -23,9 +23,11 @@ from colmap_netvlad.colmap.database import image_names, open_database
 from colmap_netvlad.commands.report import find_positions, model_of, report, save_run
 from colmap_netvlad.demo.simulate import FOCAL, SimulationOptions, simulate_flight
 from colmap_netvlad.graph.lookalikes import Lookalike
+from colmap_netvlad.graph.pair import as_pair
 from colmap_netvlad.mapping.incremental import map_incremental
 from colmap_netvlad.photos.shutters import RollingShutter
 from colmap_netvlad.report import missing as reasons
+from colmap_netvlad.report import quality as quality_module
 from colmap_netvlad.report.cameras import camera_reports
 from colmap_netvlad.report.flight_page import render_flight_page
 from colmap_netvlad.report.ground import fit_frame, overlap_map
@@ -236,6 +238,20 @@ def test_a_good_model_is_green_and_a_poor_one_says_why(mapped):
     lines = verdict_lines(poor, checks, Path("sparse/0/report.html"))
     assert len(lines) == 5 and lines[0].startswith("Verdict: RED (photos registered")
     assert lines[-1] == "Report: sparse/0/report.html"
+
+
+def test_weak_links_are_those_of_the_pairs_that_were_mapped(mapped, monkeypatch):
+    model, database = pycolmap.Reconstruction(mapped / "sparse/0"), mapped / "project.db"
+    source = Source("f", model, mapped / "sparse/0", database, run=Run("reconstruct"))
+    graph = measure(source).graph
+    of_first = [(graph.names[i], graph.names[j]) for i, j in graph.edges.tolist() if i == 0]
+    against = [Lookalike(as_pair(*pair), 50, "", True, 2.0) for pair in of_first[1:]]
+    monkeypatch.setattr(quality_module, "find_lookalikes", lambda *_: against)
+    for dropped, value in ((0, "none"), (len(against), "1 photo, 1 pair")):
+        quality = measure(replace(source, run=Run("reconstruct", dropped=dropped)))
+        (weak,) = (check for check in judge(quality) if check.title == "Weak links")
+        assert weak.value == value
+        assert quality.links.bridges == ((of_first[0],) if dropped else ())
 
 
 def test_positions_of_another_flight_are_red(grid):

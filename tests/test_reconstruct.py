@@ -136,12 +136,14 @@ def test_an_interrupted_mapping_leaves_no_trace(
 
 
 def test_a_given_output_that_exists_is_left_alone(
-    project_copy: MakeProject, tmp_path: Path
+    project_copy: MakeProject, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "taken").mkdir()
     (tmp_path / "taken" / "notes.txt").touch()
     assert free_output(tmp_path / "taken") == tmp_path / "taken-2"
     assert free_output(tmp_path / "new") == tmp_path / "new"
+    monkeypatch.chdir(tmp_path / "taken")
+    assert free_output(Path()) == tmp_path / "taken-2"
     with pytest.raises(InputError, match="exists already and is left as it is"):
         map_incremental(project_copy(matched=True).database, None, tmp_path / "taken")
 

@@ -6,16 +6,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import pycolmap
 from pyproj import CRS
 
 from colmap_netvlad.commands.georegister import find_models, read_model
 from colmap_netvlad.export import FORMATS, PLAIN
 from colmap_netvlad.export.world import World
-from colmap_netvlad.geo.frames import read_crs
+from colmap_netvlad.geo.frames import lacking_grids, read_crs
 from colmap_netvlad.geo.georeference import read_frame
 from colmap_netvlad.graph.verified import verified_by_name
-from colmap_netvlad.mapping.output import free_output, model_folder
+from colmap_netvlad.mapping.output import free_output, model_folder, named
 from colmap_netvlad.runtime.errors import InputError
 
 
@@ -27,11 +28,13 @@ class ExportReport:
         output: folder of the files; of several models, a folder for each in it.
         files: names relative to it.
         crs: the projected system of tables and point clouds; None where none was needed.
+        notes: what to know of it, sentences.
     """
 
     output: Path
     files: list[str]
     crs: str | None
+    notes: tuple[str, ...] = ()
 
 
 def export(
@@ -54,6 +57,7 @@ def export(
         InputError: no model, one that is not in the world for a format that needs it, an unknown
             or unprojected system, or `output` holds something already.
     """
+    sparse = named(sparse)
     folders = find_models(sparse)
     formats = formats or (*FORMATS, *PLAIN)
     projected = None if crs is None else _projected(crs)
@@ -61,8 +65,9 @@ def export(
     frames = {
         folder: read_frame(folder) for folder in folders if any(name in FORMATS for name in formats)
     }
-    output = output or free_output(sparse.with_name(f"{sparse.resolve().name}-export"))
-    name = None
+    output = output or free_output(sparse.with_name(f"{sparse.name}-export"))
+    name: str | None = None
+    notes: list[str] = []
     with model_folder(output) as temporary:
         for folder in folders:
             target = temporary if folder == sparse else temporary / folder.name
@@ -70,7 +75,9 @@ def export(
             model = read_model(folder)
             if folder in frames:
                 system = projected or CRS.from_epsg(frames[folder].epsg)
-                name = name or system.name
+                if name is None:
+                    name = system.name
+                    notes = lacking_grids(system, frames[folder].to_wgs84(np.zeros((1, 3))))
                 world = World(model, frames[folder], system, verified)
                 for chosen in formats:
                     if chosen in FORMATS:
@@ -82,13 +89,13 @@ def export(
             for path in temporary.rglob("*")
             if path.is_file()
         )
-    return ExportReport(output, files, name)
+    return ExportReport(output, files, name, tuple(notes))
 
 
 def report_lines(report: ExportReport) -> list[str]:
     """Return what `colmap-netvlad export` prints."""
     system = "" if report.crs is None else f"; CSV, LAS and shots in {report.crs}"
-    return [*report.files, f"{len(report.files)} files in {report.output}{system}."]
+    return [*report.files, *report.notes, f"{len(report.files)} files in {report.output}{system}."]
 
 
 def _write_plain(model: pycolmap.Reconstruction, formats: Sequence[str], target: Path) -> None:

@@ -12,6 +12,7 @@ from typing import Literal
 import numpy as np
 import pycolmap
 
+from colmap_netvlad.colmap.database import open_database
 from colmap_netvlad.geo.align import ERROR_LADDER, Alignment, NotAligned, align, as_it_lies
 from colmap_netvlad.geo.frames import frame_of
 from colmap_netvlad.geo.gcp import (
@@ -24,7 +25,7 @@ from colmap_netvlad.geo.gcp import (
 from colmap_netvlad.geo.georeference import Georeference, read_place, transformed
 from colmap_netvlad.geo.places import Places, find_places
 from colmap_netvlad.mapping.merge import Refused, read_sub_model, shared_points, similarity
-from colmap_netvlad.mapping.output import free_output, model_folder, numbered
+from colmap_netvlad.mapping.output import free_output, model_folder, named, numbered
 from colmap_netvlad.project import DATABASE_NAMES
 from colmap_netvlad.runtime.errors import InputError
 from colmap_netvlad.runtime.files import temporary_prefix
@@ -126,6 +127,7 @@ def georegister(
     Raises:
         InputError: no model, no positions, or not one model could be placed.
     """
+    sparse = named(sparse)
     folders = find_models(sparse)
     models = [read_model(folder) for folder in folders]
     names = sorted({name for model in models for name in _poses(model)[0]})
@@ -143,7 +145,7 @@ def georegister(
             + ", so the model cannot be georegistered."
             + "".join(f" {note}" for note in places.notes)
         )
-    output = output or free_output(sparse.with_name(f"{sparse.resolve().name}-georegistered"))
+    output = output or free_output(sparse.with_name(f"{sparse.name}-georegistered"))
     placed = []
     with model_folder(output) as temporary:
         for folder, model in zip(folders, models, strict=True):
@@ -288,18 +290,56 @@ def place_model(
     return Placed(name, georeference)
 
 
-def beside(
-    sparse: Path, database: Path | None, images: Path | None
-) -> tuple[Path | None, Path | None]:
-    """Return database and photo folder as given, else those in the folder that holds the models."""
-    for folder in sparse.resolve().parents[:2]:
-        if database is None:
-            database = next(
-                (folder / name for name in DATABASE_NAMES if (folder / name).is_file()), None
-            )
-        if images is None and (folder / "images").is_dir():
-            images = folder / "images"
-    return database, images
+def database_beside(sparse: Path, given: Path | None) -> tuple[Path | None, list[str]]:
+    """Return the database as given, else one that lies beside the models; and what to say of it.
+
+    Another flight's photos may have the same names: a database whose photos have not as many
+    keypoints as the model's is put aside.
+
+    Raises:
+        InputError: no model, or it or the database that was found cannot be read.
+    """
+    near = (folder / name for folder in _holders(sparse) for name in DATABASE_NAMES)
+    found = None if given else next((path for path in near if path.is_file()), None)
+    if found is None:
+        return given, []
+    if not _same_features(read_model(find_models(sparse)[0]), found):
+        return None, [
+            f"The database {found} is put aside: its photos have other features than the model's; "
+            "name it as `database` to use it all the same."
+        ]
+    return found, [f"Database, found beside the model: {found}."]
+
+
+def images_beside(sparse: Path, given: Path | None) -> tuple[Path | None, list[str]]:
+    """Return the photo folder as given, else `images` beside the models; and what to say of it."""
+    near = (folder / "images" for folder in _holders(sparse))
+    found = None if given else next((path for path in near if path.is_dir()), None)
+    return (given, []) if found is None else (found, [f"Photos, found beside the model: {found}."])
+
+
+def _holders(sparse: Path) -> list[Path]:
+    """Return the folders that hold a model, or a folder of models, the nearest first.
+
+    Of a model among others the folder of these counts, and the one that holds that. None farther
+    up does: it may be that of several flights.
+    """
+    sparse = sparse.resolve()
+    among = _is_model(sparse) and any(_is_model(path) for path in numbered(sparse.parent))
+    return list(sparse.parents[: 2 if among else 1])
+
+
+def _same_features(model: pycolmap.Reconstruction, database: Path) -> bool:
+    """Return whether a database has photos of a model, and those with as many keypoints."""
+    with open_database(database) as opened:
+        counts = opened.keypoint_counts()
+        held = {row.name: counts.get(row.image_id, 0) for row in opened.images()}
+    same = [
+        held[image.name] == image.num_points2D()
+        for image in model.images.values()
+        if image.name in held
+    ]
+    return bool(same) and all(same)
 
 
 def _place_by_control(

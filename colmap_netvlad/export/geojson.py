@@ -44,7 +44,8 @@ def write_cameras(world: World, path: Path) -> None:
 def write_footprints(world: World, path: Path) -> None:
     """Write the outline of each photo on level ground at the median height of its points.
 
-    Photos that look to the horizon have none and are left out.
+    Photos that look to the horizon have none and are left out, and so are those of a lens whose
+    distortion has no inverse in a corner.
     """
     found = []
     for image in world.images:
@@ -91,7 +92,8 @@ def footprint(model: pycolmap.Reconstruction, image: pycolmap.Image) -> NDArray[
     rays = rays @ image.cam_from_world().rotation.matrix()
     centre = image.projection_center()
     above = centre[2] - float(np.median(seen))
-    if above <= 0 or rays[:, 2].max() > -STEEP:
+    # A corner has no ray (NaN) where the lens's distortion has no inverse, beyond any scene.
+    if above <= 0 or not (rays[:, 2] <= -STEEP).all():
         return None
     ground: NDArray[np.float64] = centre - rays * (above / rays[:, 2:])
     return ground

@@ -11,7 +11,7 @@ from colmap_netvlad.export.world import World
 from colmap_netvlad.runtime.files import atomic_path
 
 SCALE = 0.001
-"""Coordinates are whole mm."""
+"""Coordinates are whole thousandths of the system's units: mm, where these are m."""
 
 WITH_COLOUR = 7
 """LAS's point format with colours and a coordinate system as WKT."""

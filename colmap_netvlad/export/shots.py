@@ -13,9 +13,9 @@ from colmap_netvlad.export.world import World
 def write_shots(world: World, path: Path) -> None:
     """Write a point for each camera in OpenDroneMap's layout.
 
-    `translation` is easting, northing, height of the camera; `rotation` the axis and angle (rad)
-    of camera from projected system, x right, y down, z ahead (OpenSfM's camera is COLMAP's);
-    `focal` the focal length as a share of the photo's longer side.
+    `translation` is easting, northing, height of the camera in the system's units; `rotation` the
+    axis and angle (rad) of camera from projected system, x right, y down, z ahead (OpenSfM's camera
+    is COLMAP's); `focal` the focal length as a share of the photo's longer side.
     """
     turns = Rotation.from_matrix(world.rotations).as_rotvec()
     found = []

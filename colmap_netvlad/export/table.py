@@ -16,7 +16,7 @@ COLUMNS = ("name", "easting", "northing", "height", "omega", "phi", "kappa")
 
 
 def write_table(world: World, path: Path) -> None:
-    """Write a row for each camera; m, and degrees (see `omega_phi_kappa`)."""
+    """Write a row for each camera: the system's units, and degrees (see `omega_phi_kappa`)."""
     text = io.StringIO()
     rows = csv.writer(text, lineterminator="\n")
     rows.writerow(COLUMNS)

@@ -68,7 +68,7 @@ class World:
 
     @cached_property
     def projected(self) -> Array:
-        """(N, 3) easting, northing, height of the cameras."""
+        """(N, 3) easting, northing, height of the cameras, in the projected system's units."""
         return self.frame.to_crs(self.centres, self.crs)
 
     @cached_property

@@ -7,14 +7,18 @@ ellipsoid; every conversion here is exact, and takes account of it.
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from pyproj import CRS, Transformer
+from pyproj.aoi import AreaOfInterest
 from pyproj.enums import TransformDirection
 from pyproj.exceptions import CRSError
+from pyproj.transformer import TransformerGroup
 
 from colmap_netvlad.photos.positions import middle_of
 from colmap_netvlad.runtime.errors import InputError
@@ -67,22 +71,24 @@ class LocalFrame:
     def to_crs(self, metres: Array, crs: CRS) -> Array:
         """Return (N, 3) easting, northing, height in a projected system of (N, 3) m of the frame.
 
-        Heights are those of the photos; only the horizontal place is projected.
+        Heights are those of the photos, in the system's unit (`height_unit`); only the horizontal
+        place is projected.
         """
         latitude, longitude, height = self.to_wgs84(metres).T
         to_crs = Transformer.from_crs("EPSG:4326", crs, always_xy=True)
         easting, northing = to_crs.transform(longitude, latitude)
-        return np.column_stack([easting, northing, height])
+        return np.column_stack([easting, northing, height / height_unit(crs)[1]])
 
     def from_crs(self, places: Array, crs: CRS) -> Array:
         """Return (N, 3) m of the frame of (N, 3) x, y, height in any horizontal system.
 
-        x is east or longitude, y north or latitude, whatever order the system's own axes have.
+        x is east or longitude, y north or latitude, whatever order the system's own axes have;
+        heights are in the system's unit (`height_unit`).
         """
         x, y, height = np.asarray(places, np.float64).reshape(-1, 3).T
         to_wgs84 = Transformer.from_crs(crs, "EPSG:4326", always_xy=True)
         longitude, latitude = to_wgs84.transform(x, y)
-        return self.from_wgs84(np.column_stack([latitude, longitude, height]))
+        return self.from_wgs84(np.column_stack([latitude, longitude, height * height_unit(crs)[1]]))
 
     @cached_property
     def _topocentric(self) -> Transformer:
@@ -103,6 +109,44 @@ def frame_of(geographic: Array) -> LocalFrame:
     assert middle is not None
     latitude, longitude = middle.tolist()
     return LocalFrame(round(latitude, ORIGIN_DECIMALS), round(longitude, ORIGIN_DECIMALS))
+
+
+def height_unit(crs: CRS) -> tuple[str, float]:
+    """Return the unit of heights in a system: its name, and how many m it is.
+
+    It is that of the system's vertical axis, else of its horizontal ones, and m beside degrees.
+    PROJ would leave the height of a system without a vertical axis as it is, in feet or in m.
+    """
+    axis = crs.axis_info[-1]
+    if len(crs.axis_info) == 2 and crs.is_geographic:
+        return "metre", 1.0
+    return axis.unit_name, axis.unit_conversion_factor
+
+
+def lacking_grids(crs: CRS, geographic: Array) -> list[str]:
+    """Return a sentence where PROJ has not the grids of the best transformation to a system.
+
+    It takes the best it has without a word, which is good to some m in many national systems.
+
+    Args:
+        geographic: (N, 3) latitude, longitude (degrees), height of places for which it counts.
+    """
+    latitude, longitude, _ = np.median(geographic, axis=0).tolist()
+    if not np.isfinite([latitude, longitude]).all():
+        return []
+    near: Any = AreaOfInterest(longitude, latitude, longitude, latitude)  # not as stubs have it
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of what is said here
+        group = TransformerGroup("EPSG:4326", crs.to_2d(), always_xy=True, area_of_interest=near)
+    if group.best_available or not group.transformers:
+        return []
+    accuracy = group.transformers[0].accuracy
+    good = f"good to {accuracy:g} m" if accuracy >= 0 else "of unknown accuracy"
+    files = ", ".join(grid.short_name for grid in group.unavailable_operations[0].grids)
+    return [
+        f"The transformation between WGS84 and {crs.name} is {good}: PROJ lacks {files} for a "
+        "better one (`pyproj sync` fetches its grids)."
+    ]
 
 
 def read_crs(text: str) -> CRS:

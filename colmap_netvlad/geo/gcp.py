@@ -16,7 +16,7 @@ from pyproj import CRS
 from scipy.optimize import least_squares
 
 from colmap_netvlad.geo.align import MIN_PLACES, NotAligned
-from colmap_netvlad.geo.frames import LocalFrame, read_crs
+from colmap_netvlad.geo.frames import LocalFrame, height_unit, lacking_grids, read_crs
 from colmap_netvlad.runtime.errors import InputError
 
 Array = NDArray[np.float64]
@@ -49,7 +49,8 @@ class GroundPoint:
 
     Attributes:
         name: as listed, or its number in the list.
-        place: x (east or longitude), y (north or latitude), height in the list's system.
+        place: x (east or longitude), y (north or latitude), height in the list's system and its
+            units (`geo.frames.height_unit`).
         marks: where it is seen, in the order of the list.
         check: it has no say in the model's place.
     """
@@ -75,7 +76,7 @@ class ControlList:
     notes: tuple[str, ...] = ()
 
     def geographic(self) -> Array:
-        """Return (N, 3) latitude, longitude (degrees), height of the points."""
+        """Return (N, 3) latitude, longitude (degrees), height (m) of the points."""
         places = np.array([point.place for point in self.points]).reshape(-1, 3)
         anywhere = LocalFrame(0.0, 0.0)
         return anywhere.to_wgs84(anywhere.from_crs(places, self.crs))
@@ -126,7 +127,8 @@ def read_control(path: Path, photos: Collection[str], check: Collection[str] = (
 
     The first line names the coordinate system; every other one is a mark: x y z px py photo and,
     if there is one, the point's name. Marks of one name, or of equal x y z, are one point. Photos
-    are named as in the project, or by the file name alone where that is unique.
+    are named as in the project, or by the file name alone where that is unique. Heights are in the
+    system's unit (`geo.frames.height_unit`), which is said where it is not m.
 
     Args:
         path: the list.
@@ -173,6 +175,12 @@ def read_control(path: Path, photos: Collection[str], check: Collection[str] = (
     if unknown:
         raise InputError(f"{path} lists no point {', '.join(unknown)}, named as check point.")
     notes = []
+    unit, metres = height_unit(crs)
+    if len(crs.axis_info) == 2 and metres != 1:
+        notes.append(
+            f"Heights in {path.name} are read in the unit of {numbered[0][1]}, {unit}; where they "
+            "are in m, name a system with such heights (EPSG:2263+5703 for example)."
+        )
     if strangers:
         notes.append(
             f"{len(strangers)} mark{'s' * (len(strangers) > 1)} of {path.name} "
@@ -183,6 +191,7 @@ def read_control(path: Path, photos: Collection[str], check: Collection[str] = (
         GroundPoint(name, place, tuple(marks), name in check)
         for name, place, marks in found.values()
     )
+    notes += lacking_grids(crs, ControlList(crs, points).geographic())
     return ControlList(crs, points, tuple(notes))
 
 

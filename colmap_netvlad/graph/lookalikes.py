@@ -161,11 +161,11 @@ def read_moves(database: Database) -> Moves:
     """Fit a similarity to the verified matches of every pair of a database."""
     images = database.images()
     index = {row.image_id: i for i, row in enumerate(images)}
+    size = {row.camera_id: (row.width, row.height) for row in images}
     cameras = {
-        camera_id: _camera(row.width, row.height, initial.model, initial.params)
+        camera_id: _camera(*size[camera_id], initial.model, initial.params)
         for camera_id, initial in database.cameras().items()
-        for row in images
-        if row.camera_id == camera_id
+        if camera_id in size
     }
     keypoints = lru_cache(maxsize=1024)(database.keypoints)
     pairs = sorted(

@@ -53,8 +53,14 @@ def numbered(folder: Path, before: str = "") -> list[Path]:
     return sorted(found, key=lambda path: int(number[path]))
 
 
+def named(folder: Path) -> Path:
+    """Return a folder by its name, also where the user wrote `.` or `..`: others go beside it."""
+    return folder.resolve() if folder.name in ("", "..") else folder
+
+
 def outputs(output: Path) -> list[Path]:
     """Return `output`, `<output>-2`, `-3`, ... as far as they hold something, the newest last."""
+    output = named(output)
     found, candidate = [], output
     while candidate.exists() and (not candidate.is_dir() or any(candidate.iterdir())):
         found.append(candidate)
@@ -67,5 +73,6 @@ def free_output(output: Path) -> Path:
 
     A user's models are never replaced: the newest model is the folder with the highest number.
     """
+    output = named(output)
     taken = len(outputs(output))
     return output.with_name(f"{output.name}-{taken + 1}") if taken else output

@@ -30,6 +30,7 @@ from colmap_netvlad.mapping.merge import (
     join_cameras,
     move,
     read_sub_model,
+    seen_once,
     shared_points,
     similarity,
 )
@@ -344,8 +345,7 @@ def _union(
     _, once = np.unique(keys, return_index=True)
     once.sort()
     keys, owner = keys[once], owner[once]
-    _, once = np.unique(np.stack([owner, keys >> 32], axis=1), axis=0, return_index=True)
-    once.sort()
+    once = seen_once(keys, owner)
     keys, owner = keys[once], owner[once]
     kept = np.bincount(owner, minlength=count) >= 2
     held = kept[owner]

@@ -17,6 +17,7 @@ from scipy import sparse
 
 from colmap_netvlad.colmap.database import InitialCamera, open_database
 from colmap_netvlad.graph.lookalikes import Lookalike, Moves, find_lookalikes
+from colmap_netvlad.graph.pair import Pair, as_pair
 from colmap_netvlad.graph.viewgraph import (
     MIN_INLIERS,
     GraphStatistics,
@@ -122,6 +123,11 @@ class Source:
     ground: Sequence[GroundPoint] = ()
     moves: Moves | None = None
 
+    @property
+    def dropped(self) -> bool:
+        """Whether contradicted pairs were left out before mapping."""
+        return self.run is not None and self.run.dropped > 0
+
 
 @dataclass(frozen=True)
 class Check:
@@ -156,7 +162,7 @@ class Quality:
         graph: the view graph: of verified matches where there is a database, else of common
             points.
         verified: whether it is of verified matches.
-        links: how well its part of registered images holds together.
+        links: how well its part of registered images holds together, by the pairs that were mapped.
         lookalikes: verified pairs that something speaks against, the strongest case first.
         missing: photos of the database without a pose; None without a database.
         not_shown: what the page cannot show and why, sentences.
@@ -239,10 +245,11 @@ def measure(source: Source) -> Quality:
         not_shown.append("There is no photo folder: photos are not shown.")
     cameras = camera_reports(model, data, frame, initial) if len(data.names) else []
     shutters = find_rolling_shutters(source.images, data.names) if source.images else []
+    left_out = {one.pair for one in lookalikes if one.contradicted and source.dropped}
+    links = within(graph, set(data.names), left_out).statistics()
     return Quality(
         source, data, frame, pixel, corners, overlap, cameras, shutters, graph,
-        source.database is not None, within(graph, set(data.names)).statistics(), lookalikes,
-        missing, not_shown,
+        source.database is not None, links, lookalikes, missing, not_shown,
     )  # fmt: skip
 
 
@@ -410,7 +417,7 @@ def _lookalikes(quality: Quality) -> Check | None:
             return Check(title, value, "green", f"{reason} Those in doubt are shown below.")
         return Check(title, "none found", "green", reason)
     value = f"{len(found):,} pair{_s(len(found))}"
-    if quality.source.run is not None and quality.source.run.dropped:
+    if quality.source.dropped:
         reason = "They were left out before mapping; what they look like is shown below."
         return Check(title, value, "green", reason)
     return Check(
@@ -453,11 +460,17 @@ def _cameras(quality: Quality) -> Check | None:
     return Check("Camera parameters", value, "yellow", f"{of}{first}")
 
 
-def within(graph: ViewGraph, inside: Collection[str]) -> ViewGraph:
-    """Return the part of a view graph that lies within some of its images."""
+def within(graph: ViewGraph, inside: Collection[str], left_out: Collection[Pair]) -> ViewGraph:
+    """Return the part of a view graph that lies within some of its images, without some pairs."""
     kept = np.array([name in inside for name in graph.names], bool)
     place = np.cumsum(kept) - 1
-    both = kept[graph.edges].all(axis=1) if len(graph.edges) else np.zeros(0, bool)
+    both = np.array(
+        [
+            bool(kept[i] and kept[j]) and as_pair(graph.names[i], graph.names[j]) not in left_out
+            for i, j in graph.edges.tolist()
+        ],
+        bool,
+    )
     return ViewGraph(
         tuple(name for name in graph.names if name in inside),
         place[graph.edges[both]].astype(np.int32).reshape(-1, 2),
