@@ -60,7 +60,7 @@ def timeless(comparison: Comparison) -> Comparison:
                 seconds_match=None,
                 timed_earlier=False,
                 match_measured=1.0,
-                model=method.model and replace(method.model, seconds=0.0),
+                model=method.model and replace(method.model, seconds=0.0, seconds_match=None),
             )
             for method in comparison.methods
         ),
@@ -295,6 +295,17 @@ def test_failing_mapping_is_reported_and_tried_again(project_copy: Make, monkeyp
     assert comparison.incomplete == []
     assert comparison.methods[0].model.registered == 0
     assert "no image could be registered" in workspace.html.read_text()
+
+
+def test_a_model_is_charged_the_matching_of_its_own_pairs(no_page, project_copy: Make, monkeypatch):
+    monkeypatch.setattr(models, "map_incremental", lambda *args: [])
+    comparison, workspace = compare(project_copy(), ["random"], replace(OPTIONS, reconstruct_k=2))
+    method, seconds = comparison.methods[0], workspace.pair_seconds()
+    assert method.model.k == comparison.model_k == 2
+    assert method.at_k[0].pairs < method.at_k[1].pairs == len(seconds)
+    assert method.seconds_match == pytest.approx(sum(seconds.values()))
+    share = method.at_k[0].pairs / method.at_k[1].pairs  # matched together, all take the same
+    assert method.model.seconds_match == pytest.approx(share * method.seconds_match)
 
 
 def test_a_long_exhaustive_matching_is_asked_about(no_page, project_copy: Make, monkeypatch):

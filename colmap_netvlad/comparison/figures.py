@@ -116,6 +116,10 @@ def compute_figures(
         ranking = candidate.ranking
         if ranking is not None:
             seconds_match, share = pool.seconds_of(widest[candidate.name], seconds)
+            model = candidate.model
+            if model is not None:
+                made_from = pairs[model.k][candidate.name]
+                model = replace(model, seconds_match=pool.seconds_of(made_from, seconds)[0])
             precision = metrics.mean_average_precision(ranking, evidence.truth, depth)
             result = replace(
                 result,
@@ -128,7 +132,7 @@ def compute_figures(
                 mean_average_precision=_number(precision) if candidate.ranks else None,
                 only_here=found.get(candidate.name, 0),
                 at_k=tuple(retrieval_figures(pairs[k][candidate.name], k, evidence) for k in ks),
-                model=candidate.model,
+                model=model,
             )
         methods.append(result)
     return Comparison(
