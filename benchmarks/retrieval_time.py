@@ -3,9 +3,10 @@
     python benchmarks/retrieval_time.py [--scene ../shared/data/sheffield_cross]
 
 COLMAP's vocabulary tree (index and query; the tree is built from the flight itself, its building
-is listed apart), VLAD on SIFT, the VGG-16 model and the EfficientNet-Lite0 model, each from
-photos or features to the neighbours, nothing cached; and the share of plain photo decoding in
-the deep models' time. The last column is how many times faster than the vocabulary tree.
+is listed apart), VLAD on SIFT (its codebook learned as well), the VGG-16 model and the
+EfficientNet-Lite0 model, each from photos or features to the neighbours, nothing cached; and the
+share of plain photo decoding in the deep models' time. The last column is how many times faster
+than the vocabulary tree.
 """
 
 from __future__ import annotations

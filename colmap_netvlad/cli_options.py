@@ -211,7 +211,8 @@ RETRIEVAL: tuple[Callable[[Any], Any], ...] = (
     click.option(
         "--model",
         type=FILE,
-        help="Checkpoint (.safetensors) of the descriptor model, instead of a named method.",
+        help="Checkpoint (.safetensors): the deep model of hybrid and of files of descriptors;"
+        " instead of any other method, but in compare, where these stay as they are.",
     ),
     click.option(
         "--gps",

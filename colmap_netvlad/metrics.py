@@ -39,14 +39,22 @@ def recall(pairs: Iterable[tuple[str, str]], truth: Collection[tuple[str, str]])
     return _share(len(retrieved & wanted), len(wanted))
 
 
-def average_precisions(ranking: Ranking, truth: Collection[tuple[str, str]]) -> dict[str, float]:
+def average_precisions(
+    ranking: Ranking, truth: Collection[tuple[str, str]], depth: int | None = None
+) -> dict[str, float]:
     """Return the average precision (0..1) of every image that has a true partner.
 
     AP is the mean, over the true partners of an image, of the precision of its list down to that
-    partner; a true partner that is not in the list gives 0. Of a list of K partners an image can
-    show K at most, so the mean is over min(true partners, K): a full ranking has the textbook's
-    value, a cut one the usual AP at K.
+    partner; a true partner that is not in the list gives 0. Among K partners an image can show K
+    at most, so the mean is over min(true partners, K): a full ranking has the textbook's value, a
+    cut one the usual AP at K.
+
+    Args:
+        ranking: its lists may be shorter than K, as where photos have no position.
+        truth: the correct pairs, in either order.
+        depth: K, the partners asked for; None: as many as the ranking is wide.
     """
+    depth = ranking.depth if depth is None else depth
     partners_of: dict[str, set[str]] = defaultdict(set)
     for name1, name2 in truth:
         partners_of[name1].add(name2)
@@ -57,17 +65,19 @@ def average_precisions(ranking: Ranking, truth: Collection[tuple[str, str]]) -> 
         if name not in index:
             continue
         wanted = np.array([index[p] for p in partners if p in index], dtype=np.int64)
-        listed = ranking.partners[index[name]]
+        listed = ranking.partners[index[name], :depth]
         hits = np.isin(listed[listed != NO_PARTNER], wanted)
-        possible = min(len(partners), ranking.depth)
+        possible = min(len(partners), depth)
         precision = np.cumsum(hits) / np.arange(1, hits.size + 1)
         precisions[name] = float(precision[hits].sum() / possible) if possible else 0.0
     return precisions
 
 
-def mean_average_precision(ranking: Ranking, truth: Collection[tuple[str, str]]) -> float:
+def mean_average_precision(
+    ranking: Ranking, truth: Collection[tuple[str, str]], depth: int | None = None
+) -> float:
     """Return the mean of `average_precisions`, 0..1; NaN where no image has a true partner."""
-    precisions = average_precisions(ranking, truth)
+    precisions = average_precisions(ranking, truth, depth)
     return math.fsum(precisions.values()) / len(precisions) if precisions else math.nan
 
 

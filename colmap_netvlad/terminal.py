@@ -274,11 +274,11 @@ def summary_table(comparison: Comparison) -> Table:
     """Return the summary of a comparison: a row for each measure, a column for each method."""
     from rich.table import Table
 
-    from colmap_netvlad.report.comparison import reference_sentence
+    from colmap_netvlad.report.comparison import partners_words, reference_sentence
     from colmap_netvlad.report.measures import NOT_RUNNING, shown
 
     table = Table(
-        title=f"{comparison.project}: {comparison.images:,} images, k = {comparison.k}",
+        title=f"{comparison.project}: {comparison.images:,} images, {partners_words(comparison)}",
         title_justify="left",
         caption=f"{BEST} best of the row ({NOT_RUNNING}). {reference_sentence(comparison)}",
         caption_justify="left",

@@ -73,7 +73,17 @@ def made_up(
             mean_average_precision=0.9 - 0.1 * lost,
             only_here=len(found[method]),
             at_k=tuple(retrieval_figures(pairs_at[method][k], k, evidence) for k in ks),
-            model=ModelFigures(ks[-1], 1, images - lost, 4000, 12000, 0.7, 3.0, 40.0),
+            model=ModelFigures(
+                ks[-1],
+                1,
+                images - lost,
+                4000,
+                12000,
+                0.7,
+                3.0,
+                40.0,
+                seconds_match=0.05 * len(pairs_at[method][ks[-1]]),
+            ),
         )
         for lost, method in enumerate(NOISE)
     )

@@ -169,6 +169,25 @@ def test_bow_pairs_annotate_a_scene_from_its_photos_alone(dataset: Path, tmp_pat
     assert 0 < len(scene.correct_pairs()) < tried
 
 
+def test_a_scene_says_which_method_its_pairs_came_from(
+    dataset: Path,
+    flight_database: Path,
+    tiny_checkpoint: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The model that ranked, not the method that it ranked instead of."""
+    monkeypatch.setattr(
+        "colmap_netvlad.colmap.features.extract_features",
+        lambda images, database: shutil.copy(flight_database, database),
+    )
+    monkeypatch.setattr("colmap_netvlad.matching.run.match_pairs", lambda *arguments: None)
+    (folder,) = find_scenes([dataset / "village"])
+    retrieval = RetrievalOptions(k=3, model=tiny_checkpoint, rerank=0, exact=True)
+    options = AnnotateOptions("bow", retrieval)
+    assert module._matched_database(folder, tmp_path / "database.db", options) == "tiny"
+
+
 def test_what_is_annotated_is_not_done_again_unless_photos_came(
     flight: RenderedFlight,
     annotated: Path,

@@ -283,7 +283,7 @@ def test_descriptors_of_photos_that_are_sent(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """One of them vanishes once it is known to be there, one is no more a photo."""
-    options, contents = RetrievalOptions(k=5, batch_size=1), deep._contents
+    options, contents = RetrievalOptions(k=5, batch_size=1), deep.photo_contents
     rankings = []
     for name, hide, run in (("many", unseen, lambda do: do()), ("one", lambda path: path, here)):
         project = project_copy(name=name, copy_photos=True)
@@ -295,7 +295,7 @@ def test_descriptors_of_photos_that_are_sent(
             gone.unlink()
             return found
 
-        monkeypatch.setattr(deep, "_contents", lose_one)
+        monkeypatch.setattr(deep, "photo_contents", lose_one)
         sent = Project(project.database, hide(project.images))
         rankings.append(run(lambda sent=sent: rank_project(sent, str(tiny_checkpoint), options)))
     ranking, wanted = rankings

@@ -29,6 +29,8 @@ from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.matching.options import MatchOptions
 from colmap_netvlad.matching.run import match_pairs
 from colmap_netvlad.project import Project
+from colmap_netvlad.retrieval.options import RetrievalOptions
+from colmap_netvlad.retrieval.rank import rank
 from colmap_netvlad.runtime.errors import EXIT_PARTIAL, InputError
 
 
@@ -60,7 +62,7 @@ def timeless(comparison: Comparison) -> Comparison:
                 seconds_match=None,
                 timed_earlier=False,
                 match_measured=1.0,
-                model=method.model and replace(method.model, seconds=0.0),
+                model=method.model and replace(method.model, seconds=0.0, seconds_match=None),
             )
             for method in comparison.methods
         ),
@@ -239,6 +241,84 @@ def test_methods_are_added_to_an_earlier_comparison(no_page, project_copy: Make,
     assert comparison.precision_depth == 4
 
 
+@pytest.fixture
+def ranked(monkeypatch) -> list[tuple[str, RetrievalOptions]]:
+    """What is ranked, and by which options; all of it by chance and unmatched, which is quick."""
+    calls: list[tuple[str, RetrievalOptions]] = []
+
+    def by_chance(flight, name, options):
+        calls.append((name, options))
+        return rank(flight, "random", RetrievalOptions(k=options.k))
+
+    monkeypatch.setattr(pipeline, "rank", by_chance)
+    monkeypatch.setattr(pool, "match_once", lambda *args: 0)
+    return calls
+
+
+def retrieving(**options) -> CompareOptions:
+    return replace(FAST, retrieval=RetrievalOptions(**options))
+
+
+def test_a_model_concerns_only_the_methods_that_take_one(
+    no_page, project_copy: Make, tiny_checkpoint: Path, ranked
+):
+    project, methods = project_copy(), ["vlad", "hybrid", "netvlad-o-lite", str(tiny_checkpoint)]
+    for _ in range(2):
+        assert not compare(project, methods, retrieving(model=tiny_checkpoint))[0].incomplete
+        models = {name: options.model for name, options in ranked}
+        assert models == {name: tiny_checkpoint if name == "hybrid" else None for name in methods}
+        assert len(ranked) == 4  # once
+    compare(project, methods, FAST)
+    assert [(name, options.model) for name, options in ranked[4:]] == [("hybrid", None)]
+
+
+def test_a_model_that_no_method_takes_is_refused(project_copy: Make, tiny_checkpoint: Path):
+    project = project_copy()
+    with pytest.raises(InputError, match=r"none of vlad, random takes one; .*`methods`"):
+        compare(project, METHODS, retrieving(model=tiny_checkpoint))
+    assert not (project.folder / "project-compare").exists()
+
+
+def test_a_changed_option_ranks_again(no_page, project_copy: Make, ranked):
+    project, methods = project_copy(), ["netvlad-o-lite", "vlad"]
+    changes = [retrieving(gps="off"), retrieving(gps="require"), retrieving(exact=True)]
+    changes = [FAST, *changes, replace(FAST, seed=1)]
+    for options in (*changes, *changes, retrieving(device="cpu", batch_size=1)):
+        compare(project, methods, options)
+    assert len(ranked) == len(changes) * len(methods)
+    compare(project, methods, retrieving(rerank=5))
+    assert [name for name, _ in ranked[10:]] == ["netvlad-o-lite"]  # vlad compares nothing
+
+
+def test_what_a_ranking_is_made_from_is_looked_at_again(no_page, project_copy: Make, ranked):
+    project = project_copy(copy_photos=True)
+    methods = [str(project.folder / "theirs.h5"), "vlad"]
+    masks = project.folder / "masks"
+    masks.mkdir()
+    photo = sorted(project.images.iterdir())[0]
+
+    def write(path: Path, content: bytes) -> None:
+        path.write_bytes(content)
+
+    def lose_a_position() -> None:
+        with closing(sqlite3.connect(project.database)) as connection, connection:
+            connection.execute("DELETE FROM pose_priors WHERE corr_data_id = 1")
+
+    steps = [
+        (lambda: write(project.folder / "theirs.h5", b"some"), 2),
+        (lambda: None, 0),
+        (lambda: write(project.folder / "theirs.h5", b"other"), 1),
+        (lambda: write(masks / f"{photo.name}.png", b"a mask"), 1),
+        (lambda: write(photo, photo.read_bytes() + b"more"), 1),
+        (lose_a_position, 2),
+    ]
+    for change, again in steps:
+        change()
+        before = len(ranked)
+        compare(project, methods, retrieving(masks=masks))
+        assert len(ranked) - before == again
+
+
 def test_a_failing_method_is_reported_and_the_others_finish(project_copy: Make, monkeypatch):
     project = project_copy()
     kept = pipeline.rank
@@ -295,6 +375,17 @@ def test_failing_mapping_is_reported_and_tried_again(project_copy: Make, monkeyp
     assert comparison.incomplete == []
     assert comparison.methods[0].model.registered == 0
     assert "no image could be registered" in workspace.html.read_text()
+
+
+def test_a_model_is_charged_the_matching_of_its_own_pairs(no_page, project_copy: Make, monkeypatch):
+    monkeypatch.setattr(models, "map_incremental", lambda *args: [])
+    comparison, workspace = compare(project_copy(), ["random"], replace(OPTIONS, reconstruct_k=2))
+    method, seconds = comparison.methods[0], workspace.pair_seconds()
+    assert method.model.k == comparison.model_k == 2
+    assert method.at_k[0].pairs < method.at_k[1].pairs == len(seconds)
+    assert method.seconds_match == pytest.approx(sum(seconds.values()))
+    share = method.at_k[0].pairs / method.at_k[1].pairs  # matched together, all take the same
+    assert method.model.seconds_match == pytest.approx(share * method.seconds_match)
 
 
 def test_a_long_exhaustive_matching_is_asked_about(no_page, project_copy: Make, monkeypatch):

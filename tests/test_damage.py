@@ -258,6 +258,7 @@ def test_what_colmap_refuses_is_one_sentence(project_copy: MakeProject) -> None:
         ("UPDATE codebooks SET dim = x'00'", "vlad"),
         ("UPDATE codebooks SET images = 'many'", "vlad"),
         ("UPDATE codebooks SET words = x'00'", "vlad"),
+        ("UPDATE codebooks SET seconds = 'many'", "vlad"),
         ("UPDATE descriptors SET vector = x'0000' WHERE rowid = 2", "vlad"),
         ("UPDATE photos SET stamp = 7, gps = x'00'", "hybrid"),
         ("UPDATE settings SET value = x'00'", "random"),

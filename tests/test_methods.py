@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import shutil
+import sqlite3
+import time
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -224,6 +228,37 @@ def test_vlad_describes_new_images_only(project_copy: MakeProject) -> None:
     assert again.notes[0].startswith("0 of 12 descriptors computed")
 
 
+def test_the_time_of_learning_the_codebook_is_part_of_describing(
+    project_copy: MakeProject, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    project, learn = project_copy(), vlad.learn_words
+
+    def slowly(*arguments: Any) -> Any:
+        time.sleep(1)
+        return learn(*arguments, 8)
+
+    monkeypatch.setattr(vlad, "learn_words", slowly)
+    first = rank(project, "vlad", RetrievalOptions(k=3))
+    assert first.seconds_describe > 1 and "in an earlier run" not in first.notes[1]
+    again = rank(project, "vlad", RetrievalOptions(k=3))
+    assert again.seconds_describe == first.seconds_describe
+    assert "in an earlier run, which are part of describing" in again.notes[1]
+
+
+def test_a_codebook_of_a_cache_that_kept_no_seconds_is_learned_again(
+    project_copy: MakeProject, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    project, learn = project_copy(), vlad.learn_words
+    monkeypatch.setattr(vlad, "learn_words", lambda *arguments: learn(*arguments, 8))
+    first = rank(project, "vlad", RetrievalOptions(k=3))
+    with closing(sqlite3.connect(project.cache)) as connection:
+        connection.execute("ALTER TABLE codebooks DROP COLUMN seconds")
+    again = rank(project, "vlad", RetrievalOptions(k=3))
+    assert "in an earlier run" not in again.notes[1]
+    assert again.partners.tolist() == first.partners.tolist()
+    assert "in an earlier run" in rank(project, "vlad", RetrievalOptions(k=3)).notes[1]
+
+
 def test_vlad_follows_its_definition() -> None:
     generator = np.random.default_rng(0)
     descriptors = generator.integers(0, 255, (30, 128)).astype(np.uint8)
@@ -263,7 +298,7 @@ def test_bow_leaves_the_database_alone_and_says_which_tree(
     assert tree.stat().st_mtime_ns == built
     np.testing.assert_array_equal(ranking.partners, again.partners)
     given = rank(project, "bow", RetrievalOptions(k=3, vocab_tree=tree))
-    assert given.notes == (f"vocabulary tree {tree}",)
+    assert given.notes == (f"vocabulary tree {tree}", bow.ONE_THREAD)
     np.testing.assert_array_equal(ranking.partners, given.partners)
 
 

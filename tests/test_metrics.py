@@ -65,6 +65,14 @@ def test_average_precision_of_a_cut_list_is_over_what_it_can_show():
     assert metrics.average_precisions(ranking, truth)["a"] == 1.0
 
 
+def test_a_method_with_shorter_lists_is_not_favoured():
+    truth = [("a", "b"), ("a", "c"), ("a", "d"), ("a", "e")]
+    short = ranking_of([[1, 2], [], [], [], []])
+    assert short.depth == 2
+    assert metrics.average_precisions(short, truth, depth=4)["a"] == 2 / 4
+    assert metrics.mean_average_precision(short, truth, depth=4) == pytest.approx(2 / 4 / 5)
+
+
 def test_mean_average_precision_without_truth_is_not_a_number():
     assert math.isnan(metrics.mean_average_precision(ranking_of([[1], [0]]), []))
 

@@ -20,6 +20,7 @@ from colmap_netvlad.comparison.figures import retrieval_figures
 from colmap_netvlad.comparison.finds import single_finds
 from colmap_netvlad.comparison.result import MethodResult, ModelFigures, RetrievalFigures
 from colmap_netvlad.graph.pair import as_pair
+from colmap_netvlad.report import plots
 from colmap_netvlad.report.comparison import write_csv
 from colmap_netvlad.report.examples import choose_examples, hardest_images
 from colmap_netvlad.report.layout import align, lay_out
@@ -331,7 +332,9 @@ def test_without_model_and_gps_the_view_graph_gives_the_places(small):
 
 def timed(name: str, registered: int, seconds: float) -> MethodResult:
     figures = RetrievalFigures(5, 100, 90, 0.9, None, 1, 9, 0, 0)
-    model = ModelFigures(5, 2, registered, 10, 20, 0.5, 2.0, registered + 7, 1.0)
+    model = ModelFigures(
+        5, 2, registered, 10, 20, 0.5, 2.0, registered + 7, 1.0, seconds_match=seconds
+    )
     return MethodResult(
         name, "", seconds_describe=1.0, seconds_search=1.0, seconds_match=seconds,
         at_k=(figures,), model=model,
@@ -352,6 +355,27 @@ def test_least_time_is_said_only_of_methods_whose_model_is_as_complete(small):
     )
     text = render_page(comparison, evidence)
     assert "Least time in all: a (" in text and ", of those with the fullest models)" in text
+
+
+def test_total_time_and_model_are_of_the_k_the_models_were_made_from(small, tmp_path):
+    method = timed("vlad", 60, 10.0)
+    at_10 = replace(method.at_k[0], k=10)
+    method = replace(method, at_k=(*method.at_k, at_10), seconds_match=100.0)
+    value = {m.key: m.value(method) for m in MEASURES}
+    assert value["seconds_match"] == 100
+    assert value["seconds_total"] == 1 + 1 + 10 + 1 == sum(plots._stages(method))
+    evidence = replace(
+        small[1], pairs={"vlad": set()}, partners={"vlad": small[1].partners["vlad"]}, plans={}
+    )
+    comparison = replace(small[0], methods=(method,))
+    page = render_page(comparison, evidence)
+    assert "All figures at k = 10, mapping, total time and model at k = 5." in page
+    assert "Where the time goes, at k = 5" in page
+    assert "model at k" not in render_page(*small)
+    write_csv(tmp_path / "compare.csv", comparison)
+    at_5, at_10 = csv.DictReader((tmp_path / "compare.csv").open())
+    assert (at_5["seconds_total"], at_5["registered"], at_5["seconds_match"]) == ("13", "60", "")
+    assert (at_10["seconds_total"], at_10["registered"], at_10["seconds_match"]) == ("", "", "100")
 
 
 def test_photos_of_all_models_are_counted_beside_the_largest():

@@ -68,6 +68,21 @@ class SeenPhoto:
     gps: str | None = None
 
 
+@dataclass(frozen=True, eq=False)
+class Codebook:
+    """Words learned on a project.
+
+    Attributes:
+        words: (K, dim) float32.
+        images: how many images they were learned on.
+        seconds: what learning them took, s.
+    """
+
+    words: NDArray[np.float32]
+    images: int
+    seconds: float
+
+
 class Store:
     """The cache file of a project; made when it is not there. Use it as a context manager.
 
@@ -294,21 +309,27 @@ class Store:
 
     # Codebooks
 
-    def codebook(self, key: str) -> tuple[NDArray[np.float32], int] | None:
-        """Return (words, number of images they were learned on), or None."""
+    def codebook(self, key: str) -> Codebook | None:
+        """Return a codebook, or None: also where it was kept before its seconds were."""
         with self._faults():
-            row = self._db.execute(
-                "SELECT words, dim, images FROM codebooks WHERE key = ?", [key]
-            ).fetchone()
-            if row is None:
+            row = next(self._db["codebooks"].rows_where("key = ?", [key]), None)
+            if row is None or row.get("seconds") is None:
                 return None
-            return np.frombuffer(row[0], np.float32).reshape(-1, row[1]), int(row[2])
+            words = np.frombuffer(row["words"], np.float32).reshape(-1, row["dim"])
+            return Codebook(words, int(row["images"]), float(row["seconds"]))
 
-    def keep_codebook(self, key: str, words: NDArray[np.float32], images: int) -> None:
-        """Keep (K, dim) words learned on `images` images."""
-        row = {"key": key, "images": images, "dim": words.shape[1], "words": words.tobytes()}
+    def keep_codebook(self, key: str, codebook: Codebook) -> None:
+        """Keep a codebook under a key."""
+        row = {
+            "key": key,
+            "images": codebook.images,
+            "dim": codebook.words.shape[1],
+            "words": codebook.words.tobytes(),
+            "seconds": codebook.seconds,
+        }
         with self._transaction():
-            self._db["codebooks"].insert(row, replace=True)
+            # The table of an earlier version has no seconds.
+            self._db["codebooks"].insert(row, replace=True, alter=True)
 
     # Settings
 
@@ -368,7 +389,7 @@ class Store:
                 if_not_exists=True,
             )
             self._db["codebooks"].create(
-                {"key": str, "images": int, "dim": int, "words": bytes},
+                {"key": str, "images": int, "dim": int, "words": bytes, "seconds": float},
                 pk="key",
                 if_not_exists=True,
             )

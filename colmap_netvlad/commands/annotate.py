@@ -319,7 +319,7 @@ def _matched_database(folder: SceneFolder, database: Path, options: AnnotateOpti
     # What is learnt from is COLMAP's, whatever matches by default.
     colmap = MatchOptions(matcher="colmap")
     match_pairs(database, [(pair.name1, pair.name2) for pair in pairs], colmap)
-    return options.method
+    return ranking.method
 
 
 def _map(

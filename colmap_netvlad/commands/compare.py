@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -28,7 +29,7 @@ from colmap_netvlad.matching.matchers import usable_matcher
 from colmap_netvlad.matching.options import MATCHER_DEFAULT, MatchOptions
 from colmap_netvlad.pairs.union import union_of_top
 from colmap_netvlad.project import Project
-from colmap_netvlad.retrieval.methods import deep, find_method
+from colmap_netvlad.retrieval.methods import Method, deep, find_method
 from colmap_netvlad.retrieval.options import RetrievalOptions, check_k
 from colmap_netvlad.retrieval.rank import rank
 from colmap_netvlad.runtime.errors import InputError
@@ -55,7 +56,8 @@ class CompareOptions:
         reconstruct: whether each method's model is made; one made earlier is shown in any case.
         reconstruct_k: the number of partners the models are made from, one of `k`; None: the
             largest.
-        retrieval: device, vocabulary tree; its k and seed are set from here.
+        retrieval: how to rank, as far as it concerns each method; its k and seed are set from
+            here. `model` is for methods that take one (hybrid, files of descriptors).
         seed: of every method, of verification and of mapping.
         matching: who matches all pairs; where no matcher is named the folder's, COLMAP's with the
             method exhaustive, else the default.
@@ -111,13 +113,20 @@ def compare(
         `Comparison.incomplete`; the others are complete.
 
     Raises:
-        InputError: no method, an unknown one, no features, k out of range, a folder that is not
-            this project's comparison, or exhaustive matching that was not confirmed.
+        InputError: no method, an unknown one, a model that none of them takes, no features, k out
+            of range, a folder that is not this project's comparison, or exhaustive matching that
+            was not confirmed.
     """
     if k:
         options = replace(options, k=tuple(k))
     if not methods:
         raise InputError("No method to compare; name some in `methods`, bow and vlad for example.")
+    model = options.retrieval.model
+    if model is not None and not any(find_method(text).takes_model for text in methods):
+        raise InputError(
+            f"`model` {model} would be ignored: none of {', '.join(methods)} takes one; a "
+            "checkpoint is a method of its own, by its path in `methods`."
+        )
     texts = [_stable_text(text) for text in methods]
     with open_flight(project) as flight:
         return _compare(flight, texts, options, confirm)
@@ -256,9 +265,9 @@ def _rank(
         return
     count = len(flight.names)
     depth = count - 1 if count <= FULL_RANKING else ks[-1]
-    retrieval = replace(options.retrieval, k=depth, seed=options.seed)
     try:
-        key = _ranking_key(candidate.text, retrieval)
+        retrieval = _concerning(find_method(candidate.text), options, depth)
+        key = _ranking_key(candidate.text, flight, retrieval)
         kept = workspace.load_ranking(key)
         if kept is None:
             logger.info("Ranking by %s", candidate.name)
@@ -272,16 +281,30 @@ def _rank(
         candidate.failed = _reason(fault)
 
 
-def _ranking_key(text: str, options: RetrievalOptions) -> str:
-    """Everything a ranking of the same features depends on."""
+def _concerning(method: Method, options: CompareOptions, depth: int) -> RetrievalOptions:
+    """Return what concerns a method, so that its column is the method it names, and is not made
+    again for what it ignores."""
+    told = replace(options.retrieval, k=depth, seed=options.seed)
+    if not method.takes_model:
+        told = replace(told, model=None)
+    return told if method.model else replace(told, masks=None, rerank=0)
+
+
+def _ranking_key(text: str, flight: Flight, options: RetrievalOptions) -> str:
+    """Return a key of everything a ranking of the same features depends on."""
     method = find_method(text)
-    key = f"{text}-k{options.k}-seed{options.seed}"
-    if options.vocab_tree is not None:
-        key += f"-{options.vocab_tree.resolve()}-{options.vocab_tree.stat().st_mtime_ns}"
+    # The device and how many photos at once change a time at most.
+    parts = [repr(replace(options, device=None, batch_size=None))]
+    parts.append(hashlib.sha256(flight.positions.metres.tobytes()).hexdigest())
+    files = [Path(text), options.vocab_tree]
     if method.model is not None:
-        key += f"-{deep.model_fingerprint(deep.checkpoint_file(method.model))}"
-        key += f"-rerank{options.rerank}"
-    return key
+        files.append(deep.checkpoint_file(options.model or method.model))
+        folder = flight.project.images
+        if folder is not None:
+            photos = deep.photo_contents(flight.store, folder, flight.names, options.masks)
+            parts.append(repr(photos))
+    parts += [deep.model_fingerprint(file) for file in files if file and file.is_file()]
+    return f"{text}-k{options.k}-{hashlib.sha256(repr(parts).encode()).hexdigest()[:16]}"
 
 
 def _pairs(candidate: Candidate, k: int) -> set[Pair]:

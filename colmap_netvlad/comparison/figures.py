@@ -34,7 +34,8 @@ from colmap_netvlad.runtime.version import VERSION
 
 FULL_RANKING = 1000
 """Up to this many images every method ranks all others, so that average precision is the
-textbook's; search is exact there, and the first k are the same as if k were asked for."""
+textbook's; search is exact there. With a small `--rerank` the first k need not be those of
+`pairs --k`: neighbours vote for as many partners as are asked for."""
 
 
 @dataclass
@@ -115,7 +116,11 @@ def compute_figures(
         ranking = candidate.ranking
         if ranking is not None:
             seconds_match, share = pool.seconds_of(widest[candidate.name], seconds)
-            precision = metrics.mean_average_precision(ranking.top(depth), evidence.truth)
+            model = candidate.model
+            if model is not None:
+                made_from = pairs[model.k][candidate.name]
+                model = replace(model, seconds_match=pool.seconds_of(made_from, seconds)[0])
+            precision = metrics.mean_average_precision(ranking, evidence.truth, depth)
             result = replace(
                 result,
                 notes=(
@@ -131,7 +136,7 @@ def compute_figures(
                 mean_average_precision=_number(precision) if candidate.ranks else None,
                 only_here=found.get(candidate.name, 0),
                 at_k=tuple(retrieval_figures(pairs[k][candidate.name], k, evidence) for k in ks),
-                model=candidate.model,
+                model=model,
             )
         methods.append(result)
     return Comparison(

@@ -62,6 +62,7 @@ class ModelFigures:
             before this was counted.
         seconds: mapping, s.
         failed: the mapper's fault, where it did not finish.
+        seconds_match: of the pairs it was made from, as `MethodResult.seconds_match`, s.
     """
 
     k: int
@@ -74,6 +75,7 @@ class ModelFigures:
     in_any_model: int | None = None
     seconds: float = 0.0
     failed: str | None = None
+    seconds_match: float | None = None
 
 
 @dataclass(frozen=True)
@@ -172,6 +174,11 @@ class Comparison:
     def k(self) -> int:
         """The largest number of partners: the summary's and the matching times'."""
         return self.ks[-1]
+
+    @property
+    def model_k(self) -> int | None:
+        """The number of partners that the models were made from; None where there is no model."""
+        return next((method.model.k for method in self.methods if method.model), None)
 
     @property
     def incomplete(self) -> list[str]:

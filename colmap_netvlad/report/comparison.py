@@ -7,7 +7,7 @@ import io
 from pathlib import Path
 
 from colmap_netvlad.comparison.result import EXHAUSTIVE, Comparison, MethodResult
-from colmap_netvlad.report.measures import MEASURES
+from colmap_netvlad.report.measures import MEASURES, OF_MODEL
 from colmap_netvlad.runtime.files import write_atomically
 
 RETRIEVAL_COLUMNS = (
@@ -25,6 +25,14 @@ def reference_sentence(comparison: Comparison) -> str:
         f"Recall and average precision are against the union of the methods' own {pairs}: "
         "without exhaustive matching nobody knows the others, so they are upper bounds."
     )
+
+
+def partners_words(comparison: Comparison) -> str:
+    """Say at which k the figures are, and the models where these were made at another."""
+    words = f"k = {comparison.k}"
+    if comparison.model_k in (None, comparison.k):
+        return words
+    return f"{words}, mapping, total time and model at k = {comparison.model_k}"
 
 
 def write_csv(path: Path, comparison: Comparison) -> None:
@@ -45,7 +53,11 @@ def write_csv(path: Path, comparison: Comparison) -> None:
         for figures in method.at_k:
             row = [_cell(getattr(figures, column)) for column in RETRIEVAL_COLUMNS]
             last = figures is method.best_k
-            figures_of_method = [_cell(m.value(method)) for m in rest] if last else blank
+            mapped = method.model is not None and figures.k == method.model.k
+            figures_of_method = [
+                _cell(m.value(method) if (mapped if m.key in OF_MODEL else last) else None)
+                for m in rest
+            ]
             writer.writerow(
                 [method.name, figures.k, *row, *figures_of_method, failed if last else ""]
             )

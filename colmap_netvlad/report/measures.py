@@ -95,7 +95,8 @@ def _efficiency(method: MethodResult) -> float | None:
 
 def _total(method: MethodResult) -> float | None:
     retrieval = _efficiency(method) if method.ranks else 0.0
-    spent = (retrieval, method.seconds_match, _of_model(lambda m: m.seconds)(method))
+    matching = _of_model(lambda m: m.seconds_match)(method)
+    spent = (retrieval, matching, _of_model(lambda m: m.seconds)(method))
     return None if None in spent else sum(part for part in spent if part is not None)
 
 
@@ -137,7 +138,7 @@ MEASURES: tuple[Measure, ...] = (
     Measure("seconds_map", "Mapping", -1, _of_model(lambda m: m.seconds), seconds,
             "Incremental mapping.", TIME),
     Measure("seconds_total", "Total", -1, _total, seconds,
-            "Retrieval, matching and mapping.", TIME),
+            "Retrieval, matching the model's pairs, and mapping.", TIME),
     Measure("registered", "Registered images", +1, _of_model(lambda m: m.registered), count,
             "Images in the largest model.", MODEL),
     Measure("in_any_model", "Images in all models", +1, _of_model(lambda m: m.in_any_model), count,
@@ -155,6 +156,10 @@ MEASURES: tuple[Measure, ...] = (
     Measure("pairs_per_image", "Pairs per registered image", -1, _pairs_per_image,
             lambda v: f"{v:.1f}", "Pairs matched for each image of the model: the price.", MODEL),
 )  # fmt: skip
+
+
+OF_MODEL = {m.key for m in MEASURES if m.group == MODEL} | {"seconds_map", "seconds_total"}
+"""Measures that belong to the number of partners the model was made from (`ModelFigures.k`)."""
 
 
 def shown(comparison: Comparison) -> list[Measure]:

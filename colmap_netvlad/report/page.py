@@ -17,7 +17,7 @@ from colmap_netvlad.comparison.result import Comparison
 from colmap_netvlad.graph.pair import Pair, as_pair
 from colmap_netvlad.graph.verified import CORRECT_MATCHES
 from colmap_netvlad.report import plots
-from colmap_netvlad.report.comparison import notes_of, reference_sentence
+from colmap_netvlad.report.comparison import notes_of, partners_words, reference_sentence
 from colmap_netvlad.report.examples import FINDS, PARTNERS, choose_examples, hardest_images
 from colmap_netvlad.report.layout import Layout, align, lay_out
 from colmap_netvlad.report.measures import (
@@ -68,6 +68,7 @@ def render_page(comparison: Comparison, evidence: Evidence) -> str:
         comparison=comparison,
         headlines=_headlines(comparison),
         reference=reference_sentence(comparison),
+        partners=partners_words(comparison),
         apart=NOT_RUNNING,
         measures=shown(comparison),
         curves=_curves(comparison),

@@ -215,11 +215,12 @@ _EDGE_MAP = mpl.colormaps["viridis_r"]
 
 
 def _stages(method: MethodResult) -> tuple[float, float, float, float]:
-    mapping = method.model.seconds if method.model else 0.0
+    model = method.model
+    matching, mapping = (model.seconds_match, model.seconds) if model else (method.seconds_match, 0)
     return (
         method.seconds_describe or 0.0,
         method.seconds_search or 0.0,
-        method.seconds_match or 0.0,
+        matching or 0.0,
         mapping,
     )
 

@@ -52,7 +52,8 @@ class RetrievalOptions:
 
     Attributes:
         k: partners of each image, at least 1; some methods rank deeper.
-        model: a checkpoint to use instead of the named method.
+        model: a checkpoint that `hybrid` and files of descriptors run as their deep model, and
+            that ranks instead of any other method; in a comparison others keep to themselves.
         device: where networks run; None: cuda where there is one, else cpu.
         seed: of every random choice, 0 to `HIGHEST_SEED`.
         batch_size: photos described at once; None: the method's own.

@@ -82,6 +82,8 @@ def _rank(flight: Flight, method: Method, options: RetrievalOptions, least_depth
         ranking = rerank(ranking, flight.store, model, k, compared, largest_features(flight))
         note = f"up to {compared} candidates of each image compared place by place"
         ranking = replace(ranking, notes=(*ranking.notes, note))
+    if method.takes_model and options.model is not None:
+        ranking = replace(ranking, notes=(*ranking.notes, f"its deep model is {options.model}"))
     if k < options.k:
         note = f"k lowered from {options.k} to {k}: the project has {others + 1} images"
         ranking = replace(ranking, notes=(*ranking.notes, note))

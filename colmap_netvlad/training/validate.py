@@ -49,7 +49,8 @@ def score(ranking: Ranking, scene: Scene) -> Score:
         pairs = union_of_top(ranking, k)
         return accuracy([(pair.name1, pair.name2) for pair in pairs], correct)
 
-    return Score(mean_average_precision(ranking, correct), accuracy_at(10), accuracy_at(20))
+    precision = mean_average_precision(ranking, correct, len(ranking.names) - 1)
+    return Score(precision, accuracy_at(10), accuracy_at(20))
 
 
 def mean_score(scores: Sequence[Score]) -> Score:

@@ -88,7 +88,7 @@ def describe_photos(
         InputError: as `candidates`.
     """
     folder, names = flight.project.need_images(), flight.names
-    photos, left_out = _contents(flight.store, folder, names, options.masks)
+    photos, left_out = photo_contents(flight.store, folder, names, options.masks)
     key = cells_key(name_or_path, options)
     to_do = missing(flight.store, key, photos, cells=_needs_cells(options))
     bad = _describe(
@@ -146,7 +146,7 @@ def model_fingerprint(checkpoint: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _contents(
+def photo_contents(
     store: Store, folder: Path, names: Sequence[str], masks: Path | None
 ) -> tuple[dict[str, str], dict[str, str]]:
     """Return (name -> content fingerprint) and (name -> reason) of photos that have none.

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import hashlib
 import time
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_netvlad.cache.ranking import Ranking
-from colmap_netvlad.cache.store import Store
+from colmap_netvlad.cache.store import Codebook, Store
 from colmap_netvlad.colmap.database import SIFT_BYTES, Database
 from colmap_netvlad.flight import Flight
 from colmap_netvlad.retrieval.described import cache_note, missing, rank_described
@@ -40,6 +41,9 @@ NO_FEATURES = "has no SIFT features"
 def candidates(flight: Flight, options: RetrievalOptions, depth: int) -> Ranking:
     """Rank by VLAD of the SIFT features in the database.
 
+    Its codebook is learned on them: the seconds of that are among those of describing, whether it
+    was learned now or in an earlier run.
+
     Raises:
         InputError: the database has no features, or not SIFT.
     """
@@ -50,18 +54,21 @@ def candidates(flight: Flight, options: RetrievalOptions, depth: int) -> Ranking
             f"{flight.project.database} has no SIFT features, which VLAD needs; extract them with "
             "`colmap-netvlad features`."
         )
-    start = time.perf_counter()
     features = {name: flight.features[image_id] for name, image_id in ids.items()}
-    words, learned = _codebook(store, database, ids, features, options.seed)
-    seconds_codebook = time.perf_counter() - start
+    codebook, learned = _codebook(store, database, ids, features, options.seed)
+    words = codebook.words
     model = _model(words)
     to_do = missing(store, model, features)
     _describe(store, database, model, words, ids, features, to_do)
     left_out = {name: NO_FEATURES for name in flight.names if name not in ids}
-    notes = [cache_note(len(to_do), len(ids))]
-    if learned:
-        notes.append(f"codebook of {len(words)} words learned in {seconds_codebook:.1f} s")
-    return rank_described(store, model, flight.names, left_out, options, depth, "vlad", notes)
+    when = "" if learned else " in an earlier run"
+    notes = [
+        cache_note(len(to_do), len(ids)),
+        f"learning the codebook of {len(words)} words took {codebook.seconds:.1f} s{when}, which"
+        " are part of describing",
+    ]
+    ranking = rank_described(store, model, flight.names, left_out, options, depth, "vlad", notes)
+    return replace(ranking, seconds_describe=ranking.seconds_describe + codebook.seconds)
 
 
 def describe(descriptors: NDArray[np.uint8], words: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -121,20 +128,22 @@ def sample_descriptors(
 
 def _codebook(
     store: Store, database: Database, ids: dict[str, int], features: dict[str, str], seed: int
-) -> tuple[NDArray[np.float32], bool]:
-    """Return the words, from the cache where they are of this project's features and it has not
-    outgrown them, and whether they were learned now."""
+) -> tuple[Codebook, bool]:
+    """Return the codebook, from the cache where it is of this project's features and the project
+    has not outgrown it, and whether it was learned now."""
     key = f"vlad-{WORDS}-seed-{seed}"
     kept = store.codebook(key)
-    if kept is not None and kept[0].shape[1] == SIFT_BYTES and kept[1] <= len(ids):
+    if kept is not None and kept.words.shape[1] == SIFT_BYTES and kept.images <= len(ids):
         # The words of another project, or of features that were extracted again, describe none
         # or few of these.
-        described = len(ids) - len(missing(store, _model(kept[0]), features))
-        if len(ids) <= OUTGROWN * min(described, kept[1]):
-            return kept[0], False
+        described = len(ids) - len(missing(store, _model(kept.words), features))
+        if len(ids) <= OUTGROWN * min(described, kept.images):
+            return kept, False
+    start = time.perf_counter()
     words = learn_words(database, list(ids.values()), seed)
-    store.keep_codebook(key, words, len(ids))
-    return words, True
+    codebook = Codebook(words, len(ids), time.perf_counter() - start)
+    store.keep_codebook(key, codebook)
+    return codebook, True
 
 
 def _model(words: NDArray[np.float32]) -> str:
