@@ -249,6 +249,7 @@ def test_ten_models_have_a_folder_each(exported: Exported, tmp_path: Path) -> No
     [
         (("--crs", "EPSG:1"), "is not known"),
         (("--crs", "EPSG:4326"), "is in degrees"),
+        (("--crs", "EPSG:2193"), "is for another part of the world (New Zealand"),
         (("--output", "OUT"), "exists already"),
     ],
 )

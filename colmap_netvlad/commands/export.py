@@ -13,7 +13,7 @@ from pyproj import CRS
 from colmap_netvlad.commands.georegister import find_models, read_model
 from colmap_netvlad.export import FORMATS, PLAIN
 from colmap_netvlad.export.world import World
-from colmap_netvlad.geo.frames import lacking_grids, read_crs
+from colmap_netvlad.geo.frames import check_area, lacking_grids, read_crs
 from colmap_netvlad.geo.georeference import read_frame
 from colmap_netvlad.graph.verified import verified_by_name
 from colmap_netvlad.mapping.output import free_output, model_folder, named
@@ -55,7 +55,8 @@ def export(
 
     Raises:
         InputError: no model, one that is not in the world for a format that needs it, an unknown
-            or unprojected system, or `output` holds something already.
+            or unprojected system, one for another part of the world, or `output` holds something
+            already.
     """
     sparse = named(sparse)
     folders = find_models(sparse)
@@ -75,9 +76,11 @@ def export(
             model = read_model(folder)
             if folder in frames:
                 system = projected or CRS.from_epsg(frames[folder].epsg)
+                origin = frames[folder].to_wgs84(np.zeros((1, 3)))
+                check_area(system, origin)
                 if name is None:
                     name = system.name
-                    notes = lacking_grids(system, frames[folder].to_wgs84(np.zeros((1, 3))))
+                    notes = lacking_grids(system, origin)
                 world = World(model, frames[folder], system, verified)
                 for chosen in formats:
                     if chosen in FORMATS:

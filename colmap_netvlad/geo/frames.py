@@ -7,6 +7,7 @@ ellipsoid; every conversion here is exact, and takes account of it.
 
 from __future__ import annotations
 
+import re
 import warnings
 from dataclasses import dataclass
 from functools import cached_property
@@ -22,6 +23,9 @@ from pyproj.transformer import TransformerGroup
 
 from colmap_netvlad.photos.positions import middle_of
 from colmap_netvlad.runtime.errors import InputError
+
+NEIGHBOUR = 6.0
+"""Degrees beyond a system's area of use in which it is still used: a UTM zone is as wide."""
 
 ORIGIN_DECIMALS = 6
 """The origin is stated to this many decimals of a degree, about 0.1 m, and is exact as stated."""
@@ -147,6 +151,29 @@ def lacking_grids(crs: CRS, geographic: Array) -> list[str]:
         f"The transformation between WGS84 and {crs.name} is {good}: PROJ lacks {files} for a "
         "better one (`pyproj sync` fetches its grids)."
     ]
+
+
+def check_area(crs: CRS, geographic: Array) -> None:
+    """Make sure that a system is one for where the flight is, or for a zone beside it.
+
+    Args:
+        geographic: (N, 3) latitude, longitude (degrees), height of places of the flight.
+
+    Raises:
+        InputError: it is far from the system's area of use; results would be plausible numbers.
+    """
+    area = crs.area_of_use
+    if area is None:
+        return
+    latitude, longitude, _ = np.median(geographic, axis=0).tolist()
+    wide = (area.east - area.west) % 360 or 360.0
+    beyond = (longitude - area.west) % 360 - wide
+    east_or_west = max(0.0, min(beyond, 360.0 - wide - beyond))
+    if max(east_or_west, area.south - latitude, latitude - area.north) > NEIGHBOUR:
+        raise InputError(
+            f"{crs.name} is for another part of the world ({re.split('[:,]', area.name)[0]}): the "
+            f"flight is at {latitude:.4f}, {longitude:.4f}; mend `crs`."
+        )
 
 
 def read_crs(text: str) -> CRS:
