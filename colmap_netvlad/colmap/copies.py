@@ -12,7 +12,7 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
-from colmap_netvlad.colmap.database import Database, open_database, pair_id
+from colmap_netvlad.colmap.database import open_database, pair_id
 from colmap_netvlad.runtime.files import atomic_path
 
 MATCHES = ("matches", "two_view_geometries")
@@ -78,7 +78,7 @@ def copy_images(source: Path, target: Path, names: Iterable[str]) -> None:
     """
     with open_database(source) as old, _new_database(target) as new:
         wanted = set(names)
-        ids = _with_frames(old, {row.image_id for row in old.images() if row.name in wanted})
+        ids = old.with_frames({row.image_id for row in old.images() if row.name in wanted})
         pairs = [
             pair_id(*pair)
             for pair, count in old.verified_matches().items()
@@ -267,9 +267,3 @@ def _read_rows(
 
 def _columns(connection: sqlite3.Connection, table: str) -> list[str]:
     return [row[1] for row in connection.execute(f'PRAGMA table_info("{table}")')]
-
-
-def _with_frames(database: Database, ids: set[int]) -> set[int]:
-    frames = database.frames()
-    touched = {frames[image] for image in ids if image in frames}
-    return ids | {image for image, frame in frames.items() if frame in touched}

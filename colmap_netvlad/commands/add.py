@@ -28,7 +28,7 @@ from colmap_netvlad.geo.georeference import Place, read_place
 from colmap_netvlad.geo.places import find_deviations, find_places
 from colmap_netvlad.graph.pair import Pair
 from colmap_netvlad.mapping.contradicted import dropped_lines, mapping_database, moves_of
-from colmap_netvlad.mapping.extend import extend_model, largest_model, read_model
+from colmap_netvlad.mapping.extend import check_origin, extend_model, largest_model, read_model
 from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.mapping.output import free_output, numbered
 from colmap_netvlad.mapping.priors import PositionPriors
@@ -137,7 +137,8 @@ def add_photos(
         output: folder of models for the extended one; default `sparse`, `sparse-2`, ...
 
     Raises:
-        InputError: no new photos, a folder that lacks the old photos, or no such model.
+        InputError: no new photos, a folder that lacks the old photos, no such model, or one that
+            was made from another database.
     """
     model = (model or newest_model(project)).absolute()
     folder = project.need_images()
@@ -147,6 +148,7 @@ def add_photos(
     old = tuple(name for name in image_names(project.database) if name not in set(begun.photos))
     new = _new_photos(folder, old)
     before = read_model(model)
+    check_origin(project, model, before)
     _remember(project, Begun(new, str(model)))
     seconds: dict[str, float] = {}
 
@@ -197,7 +199,7 @@ def add_photos(
     else:
         mapping = MappingOptions(seed=options.seed, priors=priors)
         moves = moves_of(project) if options.drop_contradicted else None
-        with mapping_database(project, moves) as (kept, dropped):
+        with mapping_database(project, moves, before) as (kept, dropped):
             after = extend_model(kept, folder, model, target, len(usable), mapping, finish)
     quality = report_models(target, project.database, folder, moves)
     registered = registered_names([after])
