@@ -208,6 +208,15 @@ class Database:
             raise self._damaged("descriptors", "an image's kind of features")
         return longest == shortest == SIFT_BYTES and kind <= SIFT_TYPE
 
+    def not_sift(self) -> set[int]:
+        """Return the ids of images whose local descriptors are of another kind than SIFT."""
+        kind = "type" if "type" in self._columns("descriptors") else str(SIFT_TYPE)
+        rows = self.connection.execute(
+            f"SELECT image_id FROM descriptors WHERE rows > 0 AND (cols <> ? OR {kind} > ?)",
+            (SIFT_BYTES, SIFT_TYPE),
+        )
+        return {image_id for (image_id,) in rows}
+
     def feature_fingerprints(self) -> dict[int, str]:
         """Return a fingerprint of each image's local descriptors, by image id.
 
