@@ -20,6 +20,7 @@ from guided import change, rows
 from colmap_netvlad.cli import cli
 from colmap_netvlad.colmap import engine
 from colmap_netvlad.colmap.database import image_names, open_database, pair_id
+from colmap_netvlad.commands import reconstruct as command
 from colmap_netvlad.commands.match import MatchingReport, working_copy
 from colmap_netvlad.commands.reconstruct import (
     ReconstructReport,
@@ -82,6 +83,24 @@ def test_two_runs_give_the_same_model_and_the_first_one_stays(project_copy: Make
     one, two = (pycolmap.Reconstruction(report.output / "0") for report in (first, second))
     for name, pose in poses(one).items():
         assert np.array_equal(pose, poses(two)[name])
+
+
+def test_models_whose_name_another_run_took_meanwhile_get_the_next(
+    project_copy: MakeProject, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    project = project_copy(matched=True)
+    made_by_another = project.sparse / "0" / "images.bin"
+
+    def save_while_another_ends(*arguments: object) -> None:
+        made_by_another.parent.mkdir(parents=True)
+        made_by_another.touch()
+
+    monkeypatch.setattr(command, "save_runs", save_while_another_ends)
+    report = map_matched(project)
+    assert report.output == project.folder / "sparse-2"
+    assert pycolmap.Reconstruction(report.output / "0").num_reg_images() == 12
+    assert report.quality[0].page.parent == report.output / "0"
+    assert [path.name for path in project.sparse.rglob("*")] == ["0", "images.bin"]
 
 
 def test_map_without_photos_works_on_the_database_alone(

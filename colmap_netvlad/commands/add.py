@@ -30,7 +30,7 @@ from colmap_netvlad.graph.pair import Pair
 from colmap_netvlad.mapping.contradicted import dropped_lines, mapping_database, moves_of
 from colmap_netvlad.mapping.extend import check_origin, extend_model, largest_model, read_model
 from colmap_netvlad.mapping.options import MappingOptions
-from colmap_netvlad.mapping.output import free_output, numbered
+from colmap_netvlad.mapping.output import free_output, numbered, take_name
 from colmap_netvlad.mapping.priors import PositionPriors
 from colmap_netvlad.mapping.summary import ModelSummary, registered_names, summarize
 from colmap_netvlad.matching.options import MatchOptions, MatchReport, given_up_words
@@ -179,20 +179,22 @@ def add_photos(
     place, placed = read_place(model), None
     priors = priors_of(project, place) if place is not None and place.adjusted else None
 
+    made = made_before(output or project.sparse, run) if begun.photos else None
+    target = made or free_output(output or project.sparse)
+    _remember(project, Begun(new, str(model), str(target.absolute())))
+
     def finish(models: Path) -> None:
-        """Bring the model to where the one given is, and note how it was made."""
-        nonlocal placed
+        """Bring the model to where the one given is, note how it was made, and name it."""
+        nonlocal placed, target
         if place is not None:
             adjusted = priors is not None
             placed = keep_place(model, models / "0", project.database, folder, adjusted=adjusted)
         seconds["mapping"] = time.monotonic() - start
         save_runs(models, replace(run, seconds=seconds, dropped=len(dropped)))
+        target = take_name(models, output or project.sparse)
 
     remove_scratch(project.folder)  # the copy that a stopped run mapped from
     moves = None
-    made = made_before(output or project.sparse, run) if begun.photos else None
-    target = made or free_output(output or project.sparse)
-    _remember(project, Begun(new, str(model), str(target.absolute())))
     if made is not None:
         after = read_model(target / "0")
         seconds["mapping"] = 0.0
@@ -201,6 +203,7 @@ def add_photos(
         moves = moves_of(project) if options.drop_contradicted else None
         with mapping_database(project, moves, before) as (kept, dropped):
             after = extend_model(kept, folder, model, target, len(usable), mapping, finish)
+        _remember(project, Begun(new, str(model), str(target.absolute())))
     quality = report_models(target, project.database, folder, moves)
     registered = registered_names([after])
     _remember(project, Begun())

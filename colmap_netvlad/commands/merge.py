@@ -23,7 +23,7 @@ from colmap_netvlad.commands.georegister import (
 from colmap_netvlad.geo.align import MIN_PLACES
 from colmap_netvlad.geo.places import find_places
 from colmap_netvlad.mapping.options import MappingOptions
-from colmap_netvlad.mapping.output import free_output, model_folder
+from colmap_netvlad.mapping.output import free_output, model_folder, take_name
 from colmap_netvlad.mapping.summary import ModelSummary, strangers, summarize
 from colmap_netvlad.mapping.together import join_and_adjust
 from colmap_netvlad.matching.options import MatchOptions
@@ -128,6 +128,8 @@ def merge_models(
         matches = match_pairs(project.database, pairs, MatchOptions(seed=options.seed))
         told = _join(project, copies, folder, options)
         placed = _georegister(project, folder, options.seed)
+        if output is None:
+            target = take_name(folder, project.sparse)
     return MergeReport(
         output=target,
         before=[(name, len(home)) for name, home in zip(names, homes, strict=True)],
