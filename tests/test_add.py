@@ -104,6 +104,21 @@ def test_new_photos_join_the_model_and_only_their_pairs_are_matched(
         add_photos(project, newest_model(project), OPTIONS)
 
 
+def test_photos_that_were_imported_but_never_matched_are_new(
+    reconstructed: tuple[Project, list[Path]],
+) -> None:
+    project, photos = reconstructed
+    assert project.images is not None
+    for photo in photos:
+        shutil.copy(photo, project.images / photo.name)
+    extract_features(project.images, project.database, OPTIONS.features)
+    report = add_photos(project, None, OPTIONS)
+    assert report.new == sorted(photo.name for photo in photos)
+    assert report.features.extracted == 0 and report.unregistered == []
+    with pytest.raises(InputError, match="no new photos"):
+        add_photos(project, None, OPTIONS)
+
+
 def centres(folder: Path) -> dict[str, np.ndarray]:
     model = pycolmap.Reconstruction(folder)
     images = (model.image(image_id) for image_id in model.reg_image_ids())
