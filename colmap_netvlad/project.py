@@ -38,6 +38,11 @@ class Project:
         return self.cache_file or self.database.with_suffix(".netvlad.db")
 
     @property
+    def copy(self) -> Path:
+        """The database that is written instead, where the user's is to stay as it is."""
+        return self.database.with_suffix(".copy.db")
+
+    @property
     def pairs(self) -> Path:
         """Where `pairs` writes by default."""
         return self.folder / "pairs.txt"

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import shutil
+import sqlite3
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
@@ -13,7 +15,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from colmap_netvlad.colmap.database import image_names, open_database
+from colmap_netvlad.colmap.database import image_names, images_of_pair, open_database
 from colmap_netvlad.colmap.features import FeatureOptions, extract_features
 from colmap_netvlad.commands import add
 from colmap_netvlad.commands.add import (
@@ -27,8 +29,13 @@ from colmap_netvlad.commands.georegister import georegister_in_place
 from colmap_netvlad.demo.render import RenderedFlight
 from colmap_netvlad.geo.georeference import read_frame, read_place
 from colmap_netvlad.geo.places import DEFAULT_DEVIATIONS, find_places
+from colmap_netvlad.graph.verified import mapped_names
+from colmap_netvlad.mapping import contradicted as contradicted_module
+from colmap_netvlad.mapping.contradicted import mapping_database, moves_of
+from colmap_netvlad.mapping.extend import read_model
 from colmap_netvlad.mapping.incremental import map_incremental
 from colmap_netvlad.mapping.options import MappingOptions
+from colmap_netvlad.mapping.summary import registered_names
 from colmap_netvlad.matching.options import MatchOptions
 from colmap_netvlad.matching.run import match_pairs
 from colmap_netvlad.project import Project
@@ -95,6 +102,21 @@ def test_new_photos_join_the_model_and_only_their_pairs_are_matched(
 
     with pytest.raises(InputError, match="no new photos"):
         add_photos(project, newest_model(project), OPTIONS)
+
+
+def test_photos_that_were_imported_but_never_matched_are_new(
+    reconstructed: tuple[Project, list[Path]],
+) -> None:
+    project, photos = reconstructed
+    assert project.images is not None
+    for photo in photos:
+        shutil.copy(photo, project.images / photo.name)
+    extract_features(project.images, project.database, OPTIONS.features)
+    report = add_photos(project, None, OPTIONS)
+    assert report.new == sorted(photo.name for photo in photos)
+    assert report.features.extracted == 0 and report.unregistered == []
+    with pytest.raises(InputError, match="no new photos"):
+        add_photos(project, None, OPTIONS)
 
 
 def centres(folder: Path) -> dict[str, np.ndarray]:
@@ -174,6 +196,82 @@ def test_photos_in_a_folder_of_their_own_are_refused_before_anything_is_written(
     with pytest.raises(InputError, match="beside the old ones"):
         add_photos(Project(project.database, elsewhere), newest_model(project), OPTIONS)
     assert project.database.read_bytes() == before
+
+
+def without_pairs(project: Project, *, of: str | None = None) -> None:
+    """Take the matches of one photo, or all, out of a database."""
+    with closing(sqlite3.connect(project.database)) as connection:
+        row = connection.execute("SELECT image_id FROM images WHERE name = ?", (of,)).fetchone()
+        for table in ("matches", "two_view_geometries"):
+            for (pair,) in connection.execute(f"SELECT pair_id FROM {table}").fetchall():
+                if row is None or row[0] in images_of_pair(pair):
+                    connection.execute(f"DELETE FROM {table} WHERE pair_id = ?", (pair,))
+        connection.commit()
+
+
+def refusal(project: Project, photo: Path) -> str:
+    """Return why a photo cannot be added, which must not write the database."""
+    assert project.images is not None
+    shutil.copy(photo, project.images / photo.name)
+    before = project.database.read_bytes()
+    with pytest.raises(InputError) as refused:
+        add_photos(project, newest_model(project), OPTIONS)
+    assert project.database.read_bytes() == before
+    return refused.value.message
+
+
+def test_a_registered_photo_without_a_verified_pair_is_named_before_anything_is_written(
+    reconstructed: tuple[Project, list[Path]],
+) -> None:
+    project, photos = reconstructed
+    without_pairs(project, of="DJI_0003.JPG")
+    said = refusal(project, photos[0])
+    assert (
+        "no verified pair of photos" in said and "(DJI_0003.JPG)" in said and "then `match`" in said
+    )
+
+
+def test_a_model_whose_matches_are_in_a_copy_names_the_copy(
+    reconstructed: tuple[Project, list[Path]],
+) -> None:
+    project, photos = reconstructed
+    shutil.copy(project.database, project.folder / "project.copy.db")
+    without_pairs(project)
+    assert "project.copy.db; name that as `database`" in refusal(project, photos[0])
+
+
+def test_a_model_of_another_extraction_is_refused_before_anything_is_written(
+    reconstructed: tuple[Project, list[Path]],
+) -> None:
+    project, photos = reconstructed
+    with closing(sqlite3.connect(project.database)) as connection:
+        for table, size in (("keypoints", "4 * cols"), ("descriptors", "cols")):
+            connection.execute(
+                f"UPDATE {table} SET rows = 900, data = substr(data, 1, 900 * {size})"
+                " WHERE image_id = 2"
+            )
+        connection.commit()
+    assert "made of other features than those in" in refusal(project, photos[0])
+    with closing(sqlite3.connect(project.database)) as connection:
+        connection.execute("UPDATE images SET name = 'other.jpg' WHERE image_id = 2")
+        connection.commit()
+    assert "project.db does not have (DJI_0002.JPG)" in refusal(project, photos[0])
+
+
+def test_a_registered_photo_keeps_its_pairs_where_all_are_contradicted(
+    reconstructed: tuple[Project, list[Path]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """COLMAP goes on from no model of which it passes over a photo."""
+    project, _ = reconstructed
+    lone, *others = sorted(image_names(project.database))
+    contradicted = [*((lone, other) for other in others), (others[0], others[1])]
+    monkeypatch.setattr(contradicted_module, "contradicted_pairs", lambda *_: contradicted)
+    model = read_model(newest_model(project))
+    with mapping_database(project, moves_of(project), model) as (database, dropped):
+        assert dropped == [(others[0], others[1])]
+        assert mapped_names(database) >= registered_names([model]) >= {lone}
+    with mapping_database(project, moves_of(project)) as (database, dropped):
+        assert dropped == contradicted and lone not in mapped_names(database)
 
 
 def test_a_broken_new_photo_is_one_sentence(reconstructed: tuple[Project, list[Path]]) -> None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import sqlite3
 import subprocess
 import sys
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -167,6 +169,20 @@ def test_imported_images_without_features_get_them_and_keep_their_camera(images:
     assert len(set(before.values())) == 3
     assert extract(images).extracted == 3
     assert {name: row.camera_id for name, row in rows(images).items()} == before
+
+
+def test_sift_is_not_put_beside_other_features(images: Path) -> None:
+    extract(images)
+    database = images.parent / "project.db"
+    with closing(sqlite3.connect(database)) as connection:
+        connection.execute("UPDATE descriptors SET type = 1 WHERE image_id = 2")
+        connection.commit()
+    assert extract(images).already == 3, "nothing is to be extracted"
+    save_jpeg(images / "new.jpg", scene(9))
+    before = database.read_bytes()
+    with pytest.raises(InputError, match=r"other local features than SIFT \(of 1\.jpg\)"):
+        extract(images)
+    assert database.read_bytes() == before
 
 
 def test_features_are_the_same_twice(images: Path, tmp_path: Path) -> None:

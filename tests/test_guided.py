@@ -380,28 +380,25 @@ def test_keypoints_that_are_not_finite_are_passed_over(
         "UPDATE descriptors SET cols = 64, data = substr(data, 1, 64 * rows) WHERE image_id = 1",
     ],
 )
-def test_features_that_are_not_sift_go_to_colmap(
-    statement: str,
-    project_copy: MakeProject,
-    caplog: pytest.LogCaptureFixture,
-    monkeypatch: pytest.MonkeyPatch,
+def test_features_that_are_not_sift_are_refused_before_anything_is_written(
+    statement: str, project_copy: MakeProject
 ) -> None:
-    from colmap_netvlad.matching import colmap, matchers
-    from colmap_netvlad.matching.options import Work
-
     database = project_copy().database
     change(database, statement)
-    asked: list[object] = []
+    for options in (GUIDED, MatchOptions("colmap")):
+        with pytest.raises(InputError, match=r"DJI_0001\.JPG\) have other local feat"):
+            match_pairs(database, all_pairs(database, 3), options)
+    assert rows(database) == {}
 
-    def instead(database: Path, pairs: object, *others: object) -> Work:
-        asked.append(pairs)
-        return Work()
 
-    row = matchers.Matcher("colmap", "", instead)  # type: ignore[arg-type]
-    monkeypatch.setitem(MATCHERS, "colmap", row)
-    report = match_pairs(database, all_pairs(database, 3), GUIDED)
-    assert colmap.match_by_colmap is not instead and len(asked) == 1
-    assert report.matcher == "colmap" and "COLMAP's matcher is used" in caplog.messages[0]
+def test_sift_beside_other_features_goes_to_colmap(
+    project_copy: MakeProject, caplog: pytest.LogCaptureFixture
+) -> None:
+    database = project_copy().database
+    change(database, "UPDATE descriptors SET type = 1 WHERE image_id = 1")
+    report = match_pairs(database, all_pairs(database, 3)[-1:], GUIDED)
+    assert (report.matcher, report.matched, report.verified) == ("colmap", 1, 1)
+    assert "COLMAP's matcher is used" in caplog.messages[0]
 
 
 def test_a_database_without_descriptors_goes_to_colmap(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import shutil
 import sqlite3
 from collections.abc import Callable
 from contextlib import closing
@@ -14,10 +15,12 @@ import numpy as np
 import pycolmap
 import pytest
 from click.testing import CliRunner
+from guided import change, rows
 
 from colmap_netvlad.cli import cli
 from colmap_netvlad.colmap import engine
-from colmap_netvlad.colmap.database import image_names
+from colmap_netvlad.colmap.database import image_names, open_database, pair_id
+from colmap_netvlad.commands import reconstruct as command
 from colmap_netvlad.commands.match import MatchingReport, working_copy
 from colmap_netvlad.commands.reconstruct import (
     ReconstructReport,
@@ -28,6 +31,7 @@ from colmap_netvlad.mapping.incremental import map_incremental
 from colmap_netvlad.mapping.output import free_output
 from colmap_netvlad.mapping.summary import ModelSummary, combine, registered_names, summarize
 from colmap_netvlad.matching.options import MatchReport
+from colmap_netvlad.matching.run import match_pairs
 from colmap_netvlad.project import Project
 from colmap_netvlad.runtime.errors import InputError
 from colmap_netvlad.terminal import models_table
@@ -81,6 +85,24 @@ def test_two_runs_give_the_same_model_and_the_first_one_stays(project_copy: Make
         assert np.array_equal(pose, poses(two)[name])
 
 
+def test_models_whose_name_another_run_took_meanwhile_get_the_next(
+    project_copy: MakeProject, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    project = project_copy(matched=True)
+    made_by_another = project.sparse / "0" / "images.bin"
+
+    def save_while_another_ends(*arguments: object) -> None:
+        made_by_another.parent.mkdir(parents=True)
+        made_by_another.touch()
+
+    monkeypatch.setattr(command, "save_runs", save_while_another_ends)
+    report = map_matched(project)
+    assert report.output == project.folder / "sparse-2"
+    assert pycolmap.Reconstruction(report.output / "0").num_reg_images() == 12
+    assert report.quality[0].page.parent == report.output / "0"
+    assert [path.name for path in project.sparse.rglob("*")] == ["0", "images.bin"]
+
+
 def test_map_without_photos_works_on_the_database_alone(
     project_copy: MakeProject, tmp_path: Path
 ) -> None:
@@ -106,13 +128,68 @@ def test_a_copy_of_other_features_is_made_anew(project_copy: MakeProject) -> Non
     project = project_copy(matched=True)
     copy = working_copy(project)
     assert copy.database.name == "project.copy.db" and copy.images == project.images
-    copy.database.write_bytes(project_copy(name="other").database.read_bytes())
+    change(copy.database, "DELETE FROM matches", "DELETE FROM two_view_geometries")
     marked = copy.database.stat().st_ino
     assert working_copy(project).database.stat().st_ino == marked  # same images and features
     connection = pycolmap.Database.open(copy.database)
     connection.clear_keypoints()
     connection.close()
     assert working_copy(project).database.stat().st_ino != marked
+
+
+def test_a_database_of_the_users_with_the_name_of_a_copy_is_left_alone(
+    project_copy: MakeProject,
+) -> None:
+    project = project_copy()
+    shutil.copy(project.database, project.copy)
+    before = project.copy.read_bytes()
+    with pytest.raises(InputError, match=r"project\.copy\.db is there already, was not made as"):
+        working_copy(project)
+    assert project.copy.read_bytes() == before
+
+
+def test_a_copy_with_photos_of_its_own_is_left_alone(project_copy: MakeProject) -> None:
+    project = project_copy()
+    copy = working_copy(project).database
+    change(copy, "INSERT INTO images (name, camera_id) VALUES ('added.jpg', 1)")
+    before = copy.read_bytes()
+    with pytest.raises(InputError, match=r"does not have \(added\.jpg\)"):
+        working_copy(project)
+    assert copy.read_bytes() == before
+
+
+def test_a_copy_follows_cameras_priors_and_features_and_keeps_its_matches(
+    project_copy: MakeProject,
+) -> None:
+    project = project_copy()
+    copy = working_copy(project).database
+    names = image_names(copy)
+    match_pairs(copy, [(names[0], names[1]), (names[1], names[2])])
+    kept = rows(copy)
+    change(
+        project.database,
+        "UPDATE cameras SET prior_focal_length = 1 - prior_focal_length",
+        "UPDATE descriptors SET data = zeroblob(128 * rows) WHERE image_id = 3",
+        "INSERT INTO images (name, camera_id) VALUES ('new.jpg', 1)",
+    )
+    working_copy(project)
+    with open_database(copy) as made, open_database(project.database) as old:
+        assert made.cameras() == old.cameras() and made.images() == old.images()
+    assert rows(copy) == {pair: row for pair, row in kept.items() if pair == pair_id(1, 2)} != {}
+    change(project.database, "UPDATE pose_priors SET coordinate_system = 1")
+    working_copy(project)
+    with open_database(copy) as made, open_database(project.database) as old:
+        assert made.pose_priors() == old.pose_priors() != {}
+    assert len(rows(copy)) == 1
+
+
+def test_matches_of_a_copy_of_an_old_colmaps_database_are_kept(legacy_database: Path) -> None:
+    """pycolmap brings the copy to another schema."""
+    project = Project(legacy_database, None)
+    copy = working_copy(project).database
+    match_pairs(copy, [image_names(copy)[:2]])
+    working_copy(project)
+    assert match_pairs(copy, [image_names(copy)[:2]]).already == 1
 
 
 def test_an_interrupted_mapping_leaves_no_trace(

@@ -102,6 +102,19 @@ def test_three_flights_become_one_as_good_as_made_at_once(own: Flights, tmp_path
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["0"]
 
 
+def test_a_model_whose_name_another_run_took_meanwhile_gets_the_next(
+    own: Flights, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def while_another_ends(project: Project, *_: object) -> list[object]:
+        (project.sparse / "0").mkdir(parents=True)
+        return []
+
+    monkeypatch.setattr(command, "_georegister", while_another_ends)
+    report = merge_models(own.project, own.models, options=MergeOptions(across=8))
+    assert report.output == own.project.folder / "sparse-2"
+    assert pycolmap.Reconstruction(report.output / "0").num_reg_images() == len(own.truth)
+
+
 def test_nothing_is_doubled(own: Flights, tmp_path: Path) -> None:
     """Matched points are one point: tracks run across flights as in the model made at once."""
     merge_models(own.project, own.models, tmp_path / "out", MergeOptions(across=8))

@@ -13,7 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from colmap_netvlad.colmap.database import Database, open_database, pair_id
-from colmap_netvlad.runtime.files import atomic_path
+from colmap_netvlad.runtime.errors import InputError
+from colmap_netvlad.runtime.files import atomic_path, scratch_folder
+from colmap_netvlad.runtime.sequences import listed
 
 MATCHES = ("matches", "two_view_geometries")
 """Tables of image pairs."""
@@ -23,6 +25,12 @@ FEATURES = ("keypoints", "descriptors")
 
 CAMERAS = ("cameras", "rigs", "rig_sensors")
 """Small tables that every subset of images needs whole."""
+
+SETTINGS = (*CAMERAS, "images", "frames", "frame_data", "pose_priors")
+"""Tables of all that is neither features nor matches."""
+
+COPY_ID = 0x636E7663
+"""sqlite's `application_id` of the copies made here; COLMAP leaves it as it is."""
 
 LOCK_SECONDS = 60.0
 """How long a process waits for the others' writing, a fraction of a second each."""
@@ -51,6 +59,51 @@ def copy_database(source: Path, target: Path, *, matches: bool) -> None:
         else:
             _copy_tables(old.connection, new, but=MATCHES)
         new.execute("PRAGMA journal_mode = DELETE")
+        new.execute(f"PRAGMA application_id = {COPY_ID}")
+
+
+def renew_copy(source: Path, copy: Path) -> None:
+    """Make a copy of a database, or bring it up to date: all is as in the source, and matches that
+    only the copy has stay, where they are of unchanged features.
+
+    Raises:
+        InputError: the copy was not made by `copy_database` or has got images of its own, and is
+            left as it is; or it cannot be written.
+    """
+    if not copy.exists():
+        copy_database(source, copy, matches=True)
+        return
+    with open_database(source) as old, open_database(copy) as made:
+        if made.connection.execute("PRAGMA application_id").fetchone() != (COPY_ID,):
+            raise InputError(
+                f"{copy} is there already, was not made as the copy of {source}, and is left as it "
+                "is: rename it, or name it as `database`."
+            )
+        theirs, ours = _features(old), _features(made)
+        if ours == theirs and _settings(old) == _settings(made):
+            return
+        own = sorted({name for name, *_ in ours.values()} - {name for name, *_ in theirs.values()})
+        if own:
+            raise InputError(
+                f"{copy} has photos that {source} does not have ({listed(own)}), and is left as it "
+                "is: name it as `database` to go on with it, or delete it for a new copy."
+            )
+        same = {image_id for image_id, features in ours.items() if theirs.get(image_id) == features}
+        pairs = [
+            pair_id(*pair)
+            for pair in made.matched_pairs() - old.matched_pairs()
+            if same.issuperset(pair)
+        ]
+    with scratch_folder(copy.parent) as folder:
+        fresh = folder / copy.name
+        copy_database(source, fresh, matches=True)
+        copy_matches(copy, fresh, pairs)
+        try:
+            for log in ("-wal", "-shm"):  # of a killed run: sqlite would play it into the new file
+                copy.with_name(copy.name + log).unlink(missing_ok=True)
+            fresh.replace(copy)
+        except OSError as fault:
+            raise InputError(f"Cannot write {copy}: {fault.strerror or fault}.") from fault
 
 
 def copy_with_pairs(source: Path, target: Path, pairs: Collection[tuple[str, str]]) -> None:
@@ -78,7 +131,7 @@ def copy_images(source: Path, target: Path, names: Iterable[str]) -> None:
     """
     with open_database(source) as old, _new_database(target) as new:
         wanted = set(names)
-        ids = _with_frames(old, {row.image_id for row in old.images() if row.name in wanted})
+        ids = old.with_frames({row.image_id for row in old.images() if row.name in wanted})
         pairs = [
             pair_id(*pair)
             for pair, count in old.verified_matches().items()
@@ -265,11 +318,18 @@ def _read_rows(
     return columns, rows
 
 
+def _features(database: Database) -> dict[int, tuple[str, int | None, str | None]]:
+    """Return each image's name, number of keypoints and fingerprint of descriptors, by image id."""
+    counts, fingerprints = database.keypoint_counts(), database.feature_fingerprints()
+    return {
+        row.image_id: (row.name, counts.get(row.image_id), fingerprints.get(row.image_id))
+        for row in database.images()
+    }
+
+
+def _settings(database: Database) -> Rows:
+    return {table: _read_rows(database.connection, table, None) for table in SETTINGS}
+
+
 def _columns(connection: sqlite3.Connection, table: str) -> list[str]:
     return [row[1] for row in connection.execute(f'PRAGMA table_info("{table}")')]
-
-
-def _with_frames(database: Database, ids: set[int]) -> set[int]:
-    frames = database.frames()
-    touched = {frames[image] for image in ids if image in frames}
-    return ids | {image for image, frame in frames.items() if frame in touched}

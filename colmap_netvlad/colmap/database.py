@@ -39,6 +39,10 @@ SIFT_BYTES = 128
 SIFT_TYPE = 0
 """`descriptors.type` of SIFT (COLMAP 4 on); -1 where a database was made before."""
 
+MAPPED_MATCHES, DEGENERATE = 15, 1
+"""COLMAP's mapper takes a pair up with at least this many verified matches (`min_num_matches`) and
+a geometry of a kind (`config`) above this."""
+
 SYSTEMS = frozenset(CoordinateSystem)
 
 VALUE_BYTES = {"keypoints": 4, "descriptors": 1, "matches": 4, "two_view_geometries": 4}
@@ -204,6 +208,15 @@ class Database:
             raise self._damaged("descriptors", "an image's kind of features")
         return longest == shortest == SIFT_BYTES and kind <= SIFT_TYPE
 
+    def not_sift(self) -> set[int]:
+        """Return the ids of images whose local descriptors are of another kind than SIFT."""
+        kind = "type" if "type" in self._columns("descriptors") else str(SIFT_TYPE)
+        rows = self.connection.execute(
+            f"SELECT image_id FROM descriptors WHERE rows > 0 AND (cols <> ? OR {kind} > ?)",
+            (SIFT_BYTES, SIFT_TYPE),
+        )
+        return {image_id for (image_id,) in rows}
+
     def feature_fingerprints(self) -> dict[int, str]:
         """Return a fingerprint of each image's local descriptors, by image id.
 
@@ -262,6 +275,15 @@ class Database:
         return {
             pair: count for found, count in rows if known.issuperset(pair := images_of_pair(found))
         }
+
+    def mapped_pairs(self) -> set[tuple[int, int]]:
+        """Return the pairs that COLMAP's mapper takes up, ids ascending."""
+        rows = self.connection.execute(
+            "SELECT pair_id FROM two_view_geometries WHERE rows >= ? AND config > ?",
+            (MAPPED_MATCHES, DEGENERATE),
+        )
+        known = self._image_ids()
+        return {pair for (found,) in rows if known.issuperset(pair := images_of_pair(found))}
 
     def inlier_matches(self, image_id1: int, image_id2: int) -> NDArray[np.uint32]:
         """Return (M, 2) keypoint indices of the verified matches, columns as the ids are given.
@@ -349,6 +371,12 @@ class Database:
                 " AND typeof(data_id) || typeof(frame_id) = 'integerinteger'"
             )
         )
+
+    def with_frames(self, ids: set[int]) -> set[int]:
+        """Return images with all others of their rig frames."""
+        frames = self.frames()
+        touched = {frames[image] for image in ids if image in frames}
+        return ids | {image for image, frame in frames.items() if frame in touched}
 
     def _legacy_priors(self) -> dict[int, PosePrior]:
         rows = self.connection.execute(
@@ -515,3 +543,14 @@ def image_names(path: Path) -> tuple[str, ...]:
     """Return the image names of a database, in the order of the image ids."""
     with open_database(path) as database:
         return tuple(row.name for row in database.images())
+
+
+def feature_counts(path: Path) -> dict[str, int]:
+    """Return the number of keypoints of each image of a database, by name; 0 where there are none.
+
+    Raises:
+        InputError: the database cannot be read, or the keypoints of an image are damaged.
+    """
+    with open_database(path) as database:
+        counts = database.keypoint_counts()
+        return {row.name: counts.get(row.image_id, 0) for row in database.images()}

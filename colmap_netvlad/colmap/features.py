@@ -37,6 +37,7 @@ from colmap_netvlad.runtime import progress, workers
 from colmap_netvlad.runtime.errors import InputError
 from colmap_netvlad.runtime.jobs import Load, Source
 from colmap_netvlad.runtime.machine import usable_memory, usable_processors
+from colmap_netvlad.runtime.sequences import listed
 
 CHUNK_PHOTOS = 8
 """Photos of one chunk for each thread; the bar moves once a chunk."""
@@ -131,13 +132,18 @@ def extract_features(
     the schema of COLMAP 4 by pycolmap.
 
     Raises:
-        InputError: no photos, unusable options, photos of different sizes for one camera, or a
-            database that cannot be written.
+        InputError: no photos, unusable options, photos of different sizes for one camera, a
+            database of other features, or one that cannot be written.
     """
     names = _check_input(images, options)
     engine.check_writable(database)
-    rows, with_features = _imported(database)
+    rows, with_features, others = _imported(database)
     todo = [name for name in names if name not in with_features]
+    if todo and others:
+        raise InputError(
+            f"{database} has other local features than SIFT (of {listed(others)}), and photos are "
+            "matched by features of one kind; import them into a new database."
+        )
     headers, bad = _read_headers(images, todo)
     if options.masks is not None:
         bad += _without_mask(headers, options.masks)
@@ -177,14 +183,19 @@ def _check_input(images: Path, options: FeatureOptions) -> list[str]:
     return names
 
 
-def _imported(database: Path) -> tuple[list[ImageRow], set[str]]:
-    """Images of the database, and the names of those with keypoints and descriptors."""
+def _imported(database: Path) -> tuple[list[ImageRow], set[str], list[str]]:
+    """Images of the database, and the names of those with keypoints and descriptors, and of those
+    with other descriptors than SIFT."""
     if not database.exists():
-        return [], set()
+        return [], set(), []
     with open_database(database) as colmap:
         rows = colmap.images()
-        done = colmap.images_with_features()
-    return rows, {row.name for row in rows if row.image_id in done}
+        done, others = colmap.images_with_features(), colmap.not_sift()
+    return (
+        rows,
+        {row.name for row in rows if row.image_id in done},
+        [row.name for row in rows if row.image_id in others],
+    )
 
 
 def _read_headers(

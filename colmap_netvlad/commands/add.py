@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 
 from colmap_netvlad.cache.ranking import NO_PARTNER, Ranking
 from colmap_netvlad.cache.store import Store
@@ -27,10 +28,11 @@ from colmap_netvlad.commands.report import (
 from colmap_netvlad.geo.georeference import Place, read_place
 from colmap_netvlad.geo.places import find_deviations, find_places
 from colmap_netvlad.graph.pair import Pair
+from colmap_netvlad.graph.verified import verified_by_name
 from colmap_netvlad.mapping.contradicted import dropped_lines, mapping_database, moves_of
-from colmap_netvlad.mapping.extend import extend_model, largest_model, read_model
+from colmap_netvlad.mapping.extend import check_origin, extend_model, largest_model, read_model
 from colmap_netvlad.mapping.options import MappingOptions
-from colmap_netvlad.mapping.output import free_output, numbered
+from colmap_netvlad.mapping.output import free_output, numbered, take_name
 from colmap_netvlad.mapping.priors import PositionPriors
 from colmap_netvlad.mapping.summary import ModelSummary, registered_names, summarize
 from colmap_netvlad.matching.options import MatchOptions, MatchReport, given_up_words
@@ -125,6 +127,8 @@ def add_photos(
 ) -> AddReport:
     """Import the photos the database does not have, and register them into a model.
 
+    Photos that were imported before, but never matched, are new as well.
+
     Features, descriptors, pairs, matches and poses are computed for the new photos alone; pairs
     are between a new photo and an old one. The model given is left as it is; where it is in the
     world, the larger one is in the same frame. Where it was stopped, it goes on with the same
@@ -137,22 +141,25 @@ def add_photos(
         output: folder of models for the extended one; default `sparse`, `sparse-2`, ...
 
     Raises:
-        InputError: no new photos, a folder that lacks the old photos, or no such model.
+        InputError: no new photos, a folder that lacks the old photos, no such model, or one that
+            was made from another database.
     """
     model = (model or newest_model(project)).absolute()
     folder = project.need_images()
     begun = _begun(project)
     if begun.photos and _extends(model) == begun.model:
         model = Path(begun.model)  # the newest model is what the stopped run had made of it
-    old = tuple(name for name in image_names(project.database) if name not in set(begun.photos))
-    new = _new_photos(folder, old)
     before = read_model(model)
+    check_origin(project, model, before)
+    pending = _unmatched(project.database, before) | set(begun.photos)
+    old = tuple(name for name in image_names(project.database) if name not in pending)
+    new = _new_photos(folder, old)
     _remember(project, Begun(new, str(model)))
     seconds: dict[str, float] = {}
 
     start = time.monotonic()
     features = extract_features(folder, project.database, options.features)
-    usable = sorted(set(image_names(project.database)) - set(old))
+    usable = sorted(set(image_names(project.database)) & set(new))
     if not usable:
         raise InputError(
             f"None of the {len(new)} new photos in {folder} can be used "
@@ -177,28 +184,31 @@ def add_photos(
     place, placed = read_place(model), None
     priors = priors_of(project, place) if place is not None and place.adjusted else None
 
+    made = made_before(output or project.sparse, run) if begun.photos else None
+    target = made or free_output(output or project.sparse)
+    _remember(project, Begun(new, str(model), str(target.absolute())))
+
     def finish(models: Path) -> None:
-        """Bring the model to where the one given is, and note how it was made."""
-        nonlocal placed
+        """Bring the model to where the one given is, note how it was made, and name it."""
+        nonlocal placed, target
         if place is not None:
             adjusted = priors is not None
             placed = keep_place(model, models / "0", project.database, folder, adjusted=adjusted)
         seconds["mapping"] = time.monotonic() - start
         save_runs(models, replace(run, seconds=seconds, dropped=len(dropped)))
+        target = take_name(models, output or project.sparse)
 
     remove_scratch(project.folder)  # the copy that a stopped run mapped from
     moves = None
-    made = made_before(output or project.sparse, run) if begun.photos else None
-    target = made or free_output(output or project.sparse)
-    _remember(project, Begun(new, str(model), str(target.absolute())))
     if made is not None:
         after = read_model(target / "0")
         seconds["mapping"] = 0.0
     else:
         mapping = MappingOptions(seed=options.seed, priors=priors)
         moves = moves_of(project) if options.drop_contradicted else None
-        with mapping_database(project, moves) as (kept, dropped):
+        with mapping_database(project, moves, before) as (kept, dropped):
             after = extend_model(kept, folder, model, target, len(usable), mapping, finish)
+        _remember(project, Begun(new, str(model), str(target.absolute())))
     quality = report_models(target, project.database, folder, moves)
     registered = registered_names([after])
     _remember(project, Begun())
@@ -295,6 +305,12 @@ def _remember(project: Project, begun: Begun) -> None:
         store.remember(BEGUN_SETTING, json.dumps(asdict(begun)))
 
 
+def _unmatched(database: Path, model: pycolmap.Reconstruction) -> set[str]:
+    """Return the photos that were imported since the model was made: no pair of them was tried."""
+    tried = {name for pair in verified_by_name(database) for name in pair}
+    return set(image_names(database)) - tried - {image.name for image in model.images.values()}
+
+
 def _new_photos(folder: Path, old: tuple[str, ...]) -> list[str]:
     there = find_photos(folder)
     if old and not set(there) & set(old):
@@ -305,7 +321,9 @@ def _new_photos(folder: Path, old: tuple[str, ...]) -> list[str]:
     new = [name for name in there if name not in set(old)]
     if not new:
         raise InputError(
-            f"There are no new photos in {folder}: the database has all {len(there)} of them."
+            f"There are no new photos in {folder}: the database has all {len(there)} of them, and "
+            "matched them; photos that the model lacks need other pairs (`colmap-netvlad pairs`, "
+            "then `reconstruct`)."
         )
     return new
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from colmap_netvlad.colmap.copies import copy_database
-from colmap_netvlad.colmap.database import image_names, open_database
+from colmap_netvlad.colmap.copies import renew_copy
+from colmap_netvlad.colmap.database import image_names
 from colmap_netvlad.commands.pairs import PairsReport
 from colmap_netvlad.graph.pair import Pair
 from colmap_netvlad.graph.verified import verified_components
@@ -95,16 +95,13 @@ def match(
 def working_copy(project: Project) -> Project:
     """Return the project on a copy of its database, `<name>.copy.db` beside it, same cache.
 
-    A copy of the same images and features is taken up again, with the matches in it; any other
-    is replaced.
+    A copy that is there is brought up to date, with the matches in it.
 
     Raises:
-        InputError: the copy cannot be written.
+        InputError: as `renew_copy`.
     """
-    copy = project.database.with_suffix(".copy.db")
-    if not (copy.exists() and _content(copy) == _content(project.database)):
-        copy_database(project.database, copy, matches=True)
-    return Project(copy, project.images, project.cache)
+    renew_copy(project.database, project.copy)
+    return Project(project.copy, project.images, project.cache)
 
 
 def report_lines(report: MatchingReport) -> list[str]:
@@ -162,9 +159,3 @@ def _spend(project: Project, rounds: RoundsOptions, options: MatchOptions) -> Ro
     if budget is None:
         budget = plan_budget(rounds.retrieval.k, len(ranking.names))
     return match_in_rounds(project, ranking, budget, rounds.rounds, options)
-
-
-def _content(database: Path) -> tuple[list[tuple[int, str]], dict[int, int], dict[int, str]]:
-    with open_database(database) as colmap:
-        names = [(row.image_id, row.name) for row in colmap.images()]
-        return names, colmap.keypoint_counts(), colmap.feature_fingerprints()

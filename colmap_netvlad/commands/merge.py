@@ -13,7 +13,7 @@ import pycolmap
 
 from colmap_netvlad.cache.ranking import NO_PARTNER, Ranking
 from colmap_netvlad.colmap import engine
-from colmap_netvlad.colmap.database import image_names, open_database
+from colmap_netvlad.colmap.database import feature_counts, image_names
 from colmap_netvlad.commands.georegister import (
     Placed,
     find_models,
@@ -23,8 +23,8 @@ from colmap_netvlad.commands.georegister import (
 from colmap_netvlad.geo.align import MIN_PLACES
 from colmap_netvlad.geo.places import find_places
 from colmap_netvlad.mapping.options import MappingOptions
-from colmap_netvlad.mapping.output import free_output, model_folder
-from colmap_netvlad.mapping.summary import ModelSummary, summarize
+from colmap_netvlad.mapping.output import free_output, model_folder, take_name
+from colmap_netvlad.mapping.summary import ModelSummary, strangers, summarize
 from colmap_netvlad.mapping.together import join_and_adjust
 from colmap_netvlad.matching.options import MatchOptions
 from colmap_netvlad.matching.run import MatchReport, match_pairs
@@ -108,9 +108,7 @@ def merge_models(
     if len(given) < 2:
         raise InputError("One model alone cannot be merged; name two or more as `sparse`.")
     names = [str(folder) for _, folder in given]
-    with open_database(project.database) as opened:
-        counts = opened.keypoint_counts()
-        features = {row.name: counts.get(row.image_id, 0) for row in opened.images()}
+    features = feature_counts(project.database)
     target = free_output(project.sparse) if output is None else output
     with (
         model_folder(target) as folder,
@@ -130,6 +128,8 @@ def merge_models(
         matches = match_pairs(project.database, pairs, MatchOptions(seed=options.seed))
         told = _join(project, copies, folder, options)
         placed = _georegister(project, folder, options.seed)
+        if output is None:
+            target = take_name(folder, project.sparse)
     return MergeReport(
         output=target,
         before=[(name, len(home)) for name, home in zip(names, homes, strict=True)],
@@ -199,19 +199,14 @@ def _in_database(
     Args:
         features: how many the database has of each image.
     """
-    strangers = sorted(image.name for image in model.images.values() if image.name not in features)
-    if strangers:
+    absent, namesakes = strangers(model, features)
+    if absent:
         raise InputError(
-            f"{len(strangers)} photos of {name} (first: {strangers[0]}) are not in "
+            f"{len(absent)} photos of {name} (first: {absent[0]}) are not in "
             f"{project.database}: bring the projects into one database first (COLMAP's "
             "database_merger; image names stay and must differ), or import all photos into one "
             "with `colmap-netvlad features`."
         )
-    namesakes = sorted(
-        image.name
-        for image in model.images.values()
-        if image.num_points2D() != features[image.name]
-    )
     if namesakes:
         raise InputError(
             f"{len(namesakes)} photos of {name} (first: {namesakes[0]}) have other features than "

@@ -41,7 +41,7 @@ from colmap_netvlad.mapping import MAPPERS, WITH_PRIORS
 from colmap_netvlad.mapping.contradicted import dropped_lines, mapping_database, moves_of
 from colmap_netvlad.mapping.extend import read_models
 from colmap_netvlad.mapping.options import MappingOptions
-from colmap_netvlad.mapping.output import free_output
+from colmap_netvlad.mapping.output import free_output, take_name
 from colmap_netvlad.mapping.parallel import forget_clusters
 from colmap_netvlad.mapping.priors import PositionPriors
 from colmap_netvlad.mapping.summary import ModelSummary, combine, registered_names, summarize
@@ -150,10 +150,13 @@ def reconstruct(
     seconds = {"matching": matches.seconds, "mapping": 0.0}
     dropped: list[Pair] = []
     placed: list[Placed] = []
+    made = made_before(output or project.sparse, run)
+    target = free_output(output or project.sparse)
     start = time.monotonic()
 
     def finish(folder: Path) -> None:
-        """Place the models, and note how they were made."""
+        """Place the models, note how they were made, and give them their name."""
+        nonlocal target
         if not any(folder.iterdir()):
             return
         if places is not None:
@@ -169,16 +172,16 @@ def reconstruct(
             )
         seconds["mapping"] = time.monotonic() - start
         save_runs(folder, replace(run, seconds=seconds, dropped=len(dropped)))
+        target = take_name(folder, output or project.sparse)
 
     remove_scratch(project.folder)  # the copy that a stopped run mapped from
     moves = None
-    target = made_before(output or project.sparse, run)
-    if target is not None and not all_reported(target):
+    if made is not None and not all_reported(made):
+        target = made
         models = read_models(target)
         forget_clusters(target)
         notes = (f"The run that made {target} was stopped before its reports; now made.", *notes)
     else:
-        target = free_output(output or project.sparse)
         mapper = MAPPERS[options.mapper]
         moves = moves_of(project) if options.drop_contradicted else None
         with mapping_database(project, moves) as (database, dropped):

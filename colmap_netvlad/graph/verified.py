@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 from colmap_netvlad.colmap.database import image_names, open_database
@@ -31,6 +31,28 @@ def verified_by_name(database: Path) -> dict[Pair, int]:
         names = {row.image_id: row.name for row in opened.images()}
         counts = opened.verified_matches()
     return {as_pair(names[a], names[b]): count for (a, b), count in counts.items()}
+
+
+def mapped_names(database: Path, but: Collection[Pair] = ()) -> set[str]:
+    """Return the images that COLMAP's mapper takes up: those with a verified pair, or of whose rig
+    frame another has one.
+
+    Args:
+        but: pairs that do not count.
+
+    Raises:
+        InputError: the database cannot be read.
+    """
+    with open_database(database) as opened:
+        names = {row.image_id: row.name for row in opened.images()}
+        left_out = set(but)
+        joined = {
+            image_id
+            for pair in opened.mapped_pairs()
+            if as_pair(names[pair[0]], names[pair[1]]) not in left_out
+            for image_id in pair
+        }
+        return {names[image_id] for image_id in opened.with_frames(joined) & names.keys()}
 
 
 CORRECT_MATCHES = 15

@@ -6,12 +6,15 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import pycolmap
+
 from colmap_netvlad.colmap.copies import copy_with_pairs
 from colmap_netvlad.colmap.database import open_database
 from colmap_netvlad.flight import open_flight
 from colmap_netvlad.graph.lookalikes import Moves, find_lookalikes, read_moves
 from colmap_netvlad.graph.pair import Pair
-from colmap_netvlad.graph.verified import verified_by_name
+from colmap_netvlad.graph.verified import mapped_names, verified_by_name
+from colmap_netvlad.mapping.summary import registered_names
 from colmap_netvlad.project import Project
 from colmap_netvlad.runtime.files import scratch_folder
 
@@ -23,7 +26,9 @@ def moves_of(project: Project) -> Moves:
 
 
 @contextmanager
-def mapping_database(project: Project, moves: Moves | None) -> Iterator[tuple[Path, list[Pair]]]:
+def mapping_database(
+    project: Project, moves: Moves | None, continued: pycolmap.Reconstruction | None = None
+) -> Iterator[tuple[Path, list[Pair]]]:
     """Yield the database to map from, and the pairs it lacks.
 
     Where contradicted pairs are to be dropped it is a copy without them, gone after the block:
@@ -31,8 +36,13 @@ def mapping_database(project: Project, moves: Moves | None) -> Iterator[tuple[Pa
 
     Args:
         moves: of its pairs (`moves_of`); None: nothing is dropped.
+        continued: model to go on from. COLMAP needs a verified pair of each of its photos: one of
+            which all pairs are contradicted keeps them.
     """
     dropped = [] if moves is None else contradicted_pairs(project, moves)
+    if dropped and continued is not None:
+        bare = registered_names([continued]) - mapped_names(project.database, but=dropped)
+        dropped = [pair for pair in dropped if bare.isdisjoint(pair)]
     if not dropped:
         yield project.database, []
         return

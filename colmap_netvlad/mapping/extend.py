@@ -7,10 +7,15 @@ from pathlib import Path
 
 import pycolmap
 
+from colmap_netvlad.colmap.database import feature_counts
+from colmap_netvlad.graph.verified import mapped_names
 from colmap_netvlad.mapping.incremental import register
 from colmap_netvlad.mapping.options import MappingOptions
 from colmap_netvlad.mapping.output import Finish, as_mapped, model_folder, numbered
+from colmap_netvlad.mapping.summary import registered_names, strangers
+from colmap_netvlad.project import Project
 from colmap_netvlad.runtime.errors import InputError
+from colmap_netvlad.runtime.sequences import listed
 
 
 def read_model(folder: Path) -> pycolmap.Reconstruction:
@@ -45,6 +50,41 @@ def largest_model(folders: Sequence[Path]) -> Path:
     if len(folders) == 1:
         return folders[0]
     return max(folders, key=lambda folder: read_model(folder).num_reg_images())
+
+
+def check_origin(project: Project, folder: Path, model: pycolmap.Reconstruction) -> None:
+    """Make sure that the model is of the database's features and matches: COLMAP would stop, when
+    the new photos are matched already.
+
+    Args:
+        folder: where the model is.
+
+    Raises:
+        InputError: it is of other photos, features or matches.
+    """
+    database = project.database
+    absent, others = strangers(model, feature_counts(database))
+    if absent:
+        raise InputError(
+            f"{folder} has photos that {database} does not have ({listed(absent)}): it is another "
+            "project's; name another model with `sparse`, or the `database` it was made from."
+        )
+    if others:
+        raise InputError(
+            f"{folder} was made of other features than those in {database} (of {listed(others)}); "
+            "name another model with `sparse`, or the `database` it was made from."
+        )
+    bare = registered_names([model]) - mapped_names(database)
+    if not bare:
+        return
+    if project.copy.is_file() and bare <= mapped_names(project.copy):
+        mend = f"its matches are in {project.copy}; name that as `database`"
+    else:
+        mend = "match them (`colmap-netvlad pairs`, then `match`), or name the `database` it is of"
+    raise InputError(
+        f"{database} has no verified pair of photos of {folder} ({listed(sorted(bare))}), without "
+        f"which COLMAP cannot extend it: {mend}."
+    )
 
 
 def extend_model(

@@ -12,7 +12,7 @@ from colmap_netvlad.runtime.files import remove_folder, temporary_prefix
 
 Finish = Callable[[Path], None]
 """What is done in a folder of new models before it gets its name: killed in between, there is no
-model that lacks it."""
+model that lacks it. It may give it a name itself (`take_name`)."""
 
 
 def as_mapped(folder: Path) -> None:
@@ -22,6 +22,8 @@ def as_mapped(folder: Path) -> None:
 @contextmanager
 def model_folder(output: Path) -> Iterator[Path]:
     """Yield a temporary folder beside `output` that becomes `output` when the block succeeds.
+
+    It keeps a name that the block has given it.
 
     Raises:
         InputError: `output` holds something already, or cannot be written.
@@ -36,14 +38,35 @@ def model_folder(output: Path) -> Iterator[Path]:
         raise InputError(f"Cannot write {output}: {fault.strerror or fault}.") from fault
     try:
         yield temporary
-        temporary.chmod(0o755)
-        if output.exists():
-            output.rmdir()
-        temporary.rename(output)
+        if temporary.exists():
+            _rename(temporary, output)
     except OSError as fault:
         raise InputError(f"Cannot write {output}: {fault.strerror or fault}.") from fault
     finally:
         remove_folder(temporary)
+
+
+def take_name(folder: Path, output: Path) -> Path:
+    """Rename a finished folder to the first free one of `output`, `<output>-2`, ...; return that.
+
+    A name that was free before the mapping may be another run's by now.
+    """
+    while True:
+        target = free_output(output)
+        try:
+            _rename(folder, target)
+        except OSError:
+            if free_output(output) == target:  # nobody took it: it cannot be written
+                raise
+        else:
+            return target
+
+
+def _rename(folder: Path, target: Path) -> None:
+    folder.chmod(0o755)
+    if target.exists():
+        target.rmdir()
+    folder.rename(target)
 
 
 def numbered(folder: Path, before: str = "") -> list[Path]:

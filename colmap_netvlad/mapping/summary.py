@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import pycolmap
@@ -46,6 +46,19 @@ def summarize(model: pycolmap.Reconstruction) -> ModelSummary:
 def registered_names(models: Sequence[pycolmap.Reconstruction]) -> set[str]:
     """Return the names of the images that have a pose in any of the models."""
     return {model.image(image_id).name for model in models for image_id in model.reg_image_ids()}
+
+
+def strangers(
+    model: pycolmap.Reconstruction, features: Mapping[str, int]
+) -> tuple[list[str], list[str]]:
+    """Return a model's images that a database does not have, and those of other features.
+
+    Args:
+        features: how many the database has of each of its images, by name.
+    """
+    images = sorted((image.name, image.num_points2D()) for image in model.images.values())
+    absent = [name for name, _ in images if name not in features]
+    return absent, [name for name, count in images if features.get(name, count) != count]
 
 
 def combine(models: Sequence[pycolmap.Reconstruction]) -> ModelSummary:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -38,9 +38,9 @@ def match_pairs(
     needs Python's `if __name__ == "__main__":`, as the processes import it again.
 
     Raises:
-        InputError: an unknown image name, no features at all or damaged ones, matches of features
-            that are no longer there, an unknown matcher, or a database that cannot be written; a
-            process that failed: what was matched by then stays.
+        InputError: an unknown image name, no features at all, damaged ones or others than SIFT,
+            matches of features that are no longer there, an unknown matcher, or a database that
+            cannot be written; a process that failed: what was matched by then stays.
     """
     engine.check_writable(database)
     with open_database(database) as colmap:
@@ -49,6 +49,7 @@ def match_pairs(
         done = colmap.matched_pairs()
         if options.thorough:
             done -= colmap.pairs_without_matches()  # those given up before among them
+        not_sift = colmap.not_sift()
         matcher, note = usable_matcher(options, colmap.has_sift())
         check_same_features(
             colmap, {_sorted_ids(ids[a], ids[b]) for a, b in pairs if {a, b} <= ids.keys()} & done
@@ -64,10 +65,10 @@ def match_pairs(
     todo = [pair for pair in requested if pair not in done]
     work, start = Work(), time.monotonic()
     if todo:
+        names = {image_id: name for name, image_id in ids.items()}
+        _check_features(database, names, todo, keypoints, descriptors, not_sift)
         if note:
             logger.warning(note)
-        names = {image_id: name for name, image_id in ids.items()}
-        _check_features(database, names, todo, keypoints, descriptors)
         engine.make_or_migrate(database)  # brings an old schema up to date
         with progress.step("Matching pairs", len(todo)) as bar:
             work = matcher.match(database, in_tiles(todo), options, bar.advance)
@@ -92,9 +93,17 @@ def _check_features(
     todo: Sequence[IdPair],
     keypoints: Mapping[int, int],
     descriptors: Mapping[int, int],
+    not_sift: Collection[int],
 ) -> None:
-    """Refuse damaged features, and say where there are none."""
+    """Refuse damaged features and those of other kinds than SIFT, and say where there are none."""
     wanted = sorted({image_id for pair in todo for image_id in pair})
+    others = [names[image_id] for image_id in wanted if image_id in not_sift]
+    if others:
+        raise InputError(
+            f"{len(others)} of the photos to match (first: {others[0]}) have other local features "
+            f"than SIFT in {database}, which no matcher here takes: match them where they were "
+            "extracted, or import the photos into a new database with `colmap-netvlad features`."
+        )
     for image_id in wanted:
         there = keypoints.get(image_id, 0), descriptors.get(image_id, 0)
         if descriptors and there[0] != there[1]:
