@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
+from models import grid_model
 
 from colmap_netvlad.colmap.copies import copy_images
 from colmap_netvlad.colmap.database import images_of_pair
@@ -22,6 +23,7 @@ from colmap_netvlad.graph.viewgraph import read_view_graph
 from colmap_netvlad.mapping import MAPPERS, parallel, pipelines, refine
 from colmap_netvlad.mapping.incremental import map_incremental
 from colmap_netvlad.mapping.options import MappingOptions
+from colmap_netvlad.mapping.output import largest_first, numbered
 from colmap_netvlad.mapping.partition import Cluster, partition
 from colmap_netvlad.runtime.errors import InputError
 
@@ -278,6 +280,7 @@ RUN = """
 import sys
 from pathlib import Path
 from colmap_netvlad.mapping.options import MappingOptions
+from colmap_netvlad.mapping.output import largest_first, numbered
 from colmap_netvlad.mapping.parallel import reconstruct_parallel
 if __name__ == "__main__":
     options = MappingOptions(cluster_size=12, threads=1)
@@ -364,3 +367,17 @@ def test_eleven_models_come_in_the_order_of_their_numbers(mapped: Mapped, tmp_pa
     output = tmp_path / "sparse"
     models = pipelines._map("somehow", write_eleven_models, mapped.database, None, output)
     assert [list(model.cameras) for model in models] == [[number + 1] for number in range(11)]
+
+
+def test_the_largest_model_is_the_first(tmp_path: Path) -> None:
+    for number, gone in enumerate((20, 0, 20, 10)):
+        model = grid_model(5)
+        for frame_id in list(model.reg_frame_ids())[:gone]:
+            model.deregister_frame(frame_id)
+        (tmp_path / str(number)).mkdir()
+        model.write(tmp_path / str(number))
+    sizes = [25, 15, 5, 5]
+    assert [model.num_reg_images() for model in largest_first(tmp_path)] == sizes
+    written = [pycolmap.Reconstruction(path).num_reg_images() for path in numbered(tmp_path)]
+    assert written == sizes
+    assert sorted(path.name for path in tmp_path.iterdir()) == list("0123")

@@ -12,7 +12,6 @@ from typing import Literal
 import numpy as np
 import pycolmap
 
-from colmap_netvlad.colmap.database import open_database
 from colmap_netvlad.geo.align import ERROR_LADDER, Alignment, NotAligned, align, as_it_lies
 from colmap_netvlad.geo.frames import frame_of
 from colmap_netvlad.geo.gcp import (
@@ -26,6 +25,7 @@ from colmap_netvlad.geo.georeference import Georeference, read_place, transforme
 from colmap_netvlad.geo.places import Places, find_places
 from colmap_netvlad.mapping.merge import Refused, read_sub_model, shared_points, similarity
 from colmap_netvlad.mapping.output import free_output, model_folder, named, numbered
+from colmap_netvlad.mapping.summary import of_database, put_aside
 from colmap_netvlad.project import DATABASE_NAMES
 from colmap_netvlad.runtime.errors import InputError
 from colmap_netvlad.runtime.files import temporary_prefix
@@ -303,11 +303,8 @@ def database_beside(sparse: Path, given: Path | None) -> tuple[Path | None, list
     found = None if given else next((path for path in near if path.is_file()), None)
     if found is None:
         return given, []
-    if not _same_features(read_model(find_models(sparse)[0]), found):
-        return None, [
-            f"The database {found} is put aside: its photos have other features than the model's; "
-            "name it as `database` to use it all the same."
-        ]
+    if not of_database(read_model(find_models(sparse)[0]), found):
+        return None, [put_aside(found)]
     return found, [f"Database, found beside the model: {found}."]
 
 
@@ -327,19 +324,6 @@ def _holders(sparse: Path) -> list[Path]:
     sparse = sparse.resolve()
     among = _is_model(sparse) and any(_is_model(path) for path in numbered(sparse.parent))
     return list(sparse.parents[: 2 if among else 1])
-
-
-def _same_features(model: pycolmap.Reconstruction, database: Path) -> bool:
-    """Return whether a database has photos of a model, and those with as many keypoints."""
-    with open_database(database) as opened:
-        counts = opened.keypoint_counts()
-        held = {row.name: counts.get(row.image_id, 0) for row in opened.images()}
-    same = [
-        held[image.name] == image.num_points2D()
-        for image in model.images.values()
-        if image.name in held
-    ]
-    return bool(same) and all(same)
 
 
 def _place_by_control(

@@ -20,6 +20,7 @@ from colmap_netvlad.geo.georeference import FILE as GEOREFERENCE
 from colmap_netvlad.graph.lookalikes import Moves
 from colmap_netvlad.mapping.extend import largest_model, read_model
 from colmap_netvlad.mapping.output import numbered, outputs
+from colmap_netvlad.mapping.summary import of_database, put_aside
 from colmap_netvlad.photos.positions import place
 from colmap_netvlad.project import DATABASE_NAMES
 from colmap_netvlad.report.flight_page import render_flight_page
@@ -100,7 +101,8 @@ def report(
     if database is None:
         beside = (place / name for place in places for name in DATABASE_NAMES)
         database = next((path for path in beside if path.is_file()), None)
-        if database is not None and not _same_photos(model, database):
+        if database is not None and model.num_images() and not of_database(model, database):
+            logger.warning(put_aside(database))
             database = None
     elif not _same_photos(model, database):
         raise InputError(

@@ -9,7 +9,7 @@ import pycolmap
 from colmap_netvlad.colmap import engine
 from colmap_netvlad.colmap.database import open_database
 from colmap_netvlad.mapping.options import MappingOptions, pipeline_options
-from colmap_netvlad.mapping.output import Finish, as_mapped, model_folder, numbered
+from colmap_netvlad.mapping.output import Finish, as_mapped, largest_first, model_folder
 from colmap_netvlad.mapping.priors import with_priors
 from colmap_netvlad.mapping.settle import settle
 from colmap_netvlad.runtime import progress
@@ -22,7 +22,7 @@ def map_incremental(
     options: MappingOptions = MappingOptions(),
     finish: Finish = as_mapped,
 ) -> list[pycolmap.Reconstruction]:
-    """Reconstruct the matched images and write `output`/0, 1, ... as COLMAP does.
+    """Reconstruct the matched images and write `output`/0, 1, ..., the largest first.
 
     Args:
         database: COLMAP database with verified matches.
@@ -32,7 +32,7 @@ def map_incremental(
         finish: is called with the folder of the models before it gets its name.
 
     Returns:
-        The models in COLMAP's order; empty where nothing could be reconstructed.
+        The models, the largest first; empty where nothing could be reconstructed.
 
     Raises:
         InputError: `output` holds something already, or cannot be written.
@@ -41,7 +41,7 @@ def map_incremental(
         total = len(colmap.keypoint_counts())
     with model_folder(output) as folder:
         register(database, images, folder, total, options)
-        models = [pycolmap.Reconstruction(path) for path in numbered(folder)]
+        models = largest_first(folder)
         finish(folder)
     return models
 

@@ -7,6 +7,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import pycolmap
+
 from colmap_netvlad.runtime.errors import InputError
 from colmap_netvlad.runtime.files import remove_folder, temporary_prefix
 
@@ -74,6 +76,22 @@ def numbered(folder: Path, before: str = "") -> list[Path]:
     number = {path: path.name.removeprefix(before) for path in folder.glob(f"{before}[0-9]*")}
     found = [path for path, digits in number.items() if digits.isdecimal()]
     return sorted(found, key=lambda path: int(number[path]))
+
+
+def largest_first(folder: Path) -> list[pycolmap.Reconstruction]:
+    """Number the models of a folder anew, the largest first, and return them.
+
+    COLMAP numbers them as it began them: `0`, which users and programs take for the model, may
+    be a stray pair of photos.
+    """
+    paths = numbered(folder)
+    models = [pycolmap.Reconstruction(path) for path in paths]
+    order = sorted(range(len(models)), key=lambda i: -models[i].num_reg_images())
+    if order != list(range(len(models))):
+        aside = [path.rename(path.with_name(f"was-{path.name}")) for path in paths]
+        for path, i in zip(paths, order, strict=True):
+            aside[i].rename(path)
+    return [models[i] for i in order]
 
 
 def named(folder: Path) -> Path:

@@ -25,7 +25,7 @@ from colmap_netvlad.colmap.copies import copy_images
 from colmap_netvlad.graph.viewgraph import ViewGraph, read_view_graph
 from colmap_netvlad.mapping.merge import merge, read_sub_model
 from colmap_netvlad.mapping.options import MappingOptions, pipeline_options
-from colmap_netvlad.mapping.output import Finish, as_mapped, model_folder, numbered
+from colmap_netvlad.mapping.output import Finish, as_mapped, largest_first, model_folder, numbered
 from colmap_netvlad.mapping.partition import Cluster, partition
 from colmap_netvlad.mapping.priors import with_priors, write_priors
 from colmap_netvlad.mapping.refine import load_cache, rebuild, refine
@@ -141,7 +141,7 @@ def reconstruct_parallel(
         state = open_state(output, graph, clusters, options)
         report = map_clusters(database, clusters, state, options)
         merge_clusters(database, images, state, folder, options, report)
-        models = [pycolmap.Reconstruction(path) for path in numbered(folder)]
+        models = largest_first(folder)
         finish(folder)
     forget_clusters(output)
     return models, report

@@ -15,7 +15,7 @@ from colmap_netvlad.colmap import engine
 from colmap_netvlad.colmap.database import open_database
 from colmap_netvlad.mapping.incremental import map_incremental
 from colmap_netvlad.mapping.options import MappingOptions, pipeline_options
-from colmap_netvlad.mapping.output import Finish, as_mapped, model_folder, numbered
+from colmap_netvlad.mapping.output import Finish, as_mapped, largest_first, model_folder
 from colmap_netvlad.mapping.parallel import CLUSTER_IMAGES, map_parallel
 from colmap_netvlad.runtime import workers
 from colmap_netvlad.runtime.errors import InputError
@@ -96,7 +96,7 @@ def _map(
         (outcome,) = workers.run([job], 1, lambda count: None, initialiser=engine.initialiser())
         if outcome.fault is not None:
             raise InputError(f"COLMAP could not map {how}: {outcome.fault}.")
-        models = [pycolmap.Reconstruction(path) for path in numbered(folder)]
+        models = largest_first(folder)
         finish(folder)
         return models
 

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import pycolmap
+
+from colmap_netvlad.colmap.database import feature_counts
 
 
 @dataclass(frozen=True)
@@ -59,6 +62,25 @@ def strangers(
     images = sorted((image.name, image.num_points2D()) for image in model.images.values())
     absent = [name for name, _ in images if name not in features]
     return absent, [name for name, count in images if features.get(name, count) != count]
+
+
+def of_database(model: pycolmap.Reconstruction, database: Path) -> bool:
+    """Return whether a database has photos of a model, and those with as many features: another
+    flight's photos may have the same names.
+
+    Raises:
+        InputError: the database cannot be read.
+    """
+    absent, others = strangers(model, feature_counts(database))
+    return not others and len(absent) < model.num_images()
+
+
+def put_aside(database: Path) -> str:
+    """Say that a database beside a model is not the model's."""
+    return (
+        f"The database {database} is put aside: its photos have other features than the model's; "
+        "name it as `database` to use it all the same."
+    )
 
 
 def combine(models: Sequence[pycolmap.Reconstruction]) -> ModelSummary:
