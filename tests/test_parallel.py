@@ -136,6 +136,26 @@ def test_components_become_models_and_an_isolated_image_is_left_out(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["database.db", "sparse"]
 
 
+def test_two_runs_do_not_share_finished_clusters(mapped: Mapped, tmp_path: Path) -> None:
+    enter = (
+        "import sys, pathlib; from colmap_netvlad.runtime.files import claimed\n"
+        "with claimed(pathlib.Path(sys.argv[1])): print(flush=True); input()"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", enter, tmp_path / ".sparse.clusters"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+    ) as other:
+        assert other.stdout is not None
+        other.stdout.readline()
+        with pytest.raises(InputError, match="Another run maps clusters for"):
+            parallel.reconstruct_parallel(mapped.database, None, tmp_path / "sparse", OPTIONS)
+        other.kill()
+    models, _ = parallel.reconstruct_parallel(mapped.database, None, tmp_path / "sparse", OPTIONS)
+    assert [model.num_reg_images() for model in models] == [32]
+    assert [path.name for path in tmp_path.iterdir()] == ["sparse"]
+
+
 def test_a_corridor_flight_is_cut_and_merged_again(tmp_path: Path) -> None:
     corridor = SimulationOptions(lines=1, photos=24, features=250, partners=6)
     truth = simulate_flight(tmp_path / "database.db", corridor)

@@ -32,7 +32,7 @@ from colmap_netvlad.mapping.refine import load_cache, rebuild, refine
 from colmap_netvlad.mapping.settle import settle_model
 from colmap_netvlad.runtime import progress, workers
 from colmap_netvlad.runtime.errors import InputError
-from colmap_netvlad.runtime.files import write_atomically
+from colmap_netvlad.runtime.files import claimed, write_atomically
 from colmap_netvlad.runtime.jobs import Load, Source
 
 logger = logging.getLogger(__name__)
@@ -118,8 +118,8 @@ def map_parallel(
         The models, largest first; empty where nothing could be reconstructed.
 
     Raises:
-        InputError: `output` holds something already, or no cluster could be reconstructed
-            because all of them failed.
+        InputError: `output` holds something already, another run is at work on it, or no cluster
+            could be reconstructed because all of them failed.
     """
     models, report = reconstruct_parallel(database, images, output, options, finish)
     for line in report_lines(report):
@@ -135,7 +135,12 @@ def reconstruct_parallel(
     finish: Finish = as_mapped,
 ) -> tuple[list[pycolmap.Reconstruction], ParallelReport]:
     """Reconstruct in clusters (see `map_parallel`) and return models and report."""
-    with model_folder(output) as folder:
+    with model_folder(output) as folder, claimed(_state(output)) as alone:
+        if not alone:
+            raise InputError(
+                f"Another run maps clusters for {output}, which would be mixed up: wait for it, or "
+                "name another `output`."
+            )
         graph = read_view_graph(database)
         clusters = partition(graph, options.cluster_size or CLUSTER_IMAGES)
         state = open_state(output, graph, clusters, options)
@@ -149,7 +154,8 @@ def reconstruct_parallel(
 
 def forget_clusters(output: Path) -> None:
     """Remove the finished clusters of models that are written."""
-    shutil.rmtree(_state(output), ignore_errors=True)
+    with claimed(_state(output)):  # takes away the claim of a killed run
+        shutil.rmtree(_state(output), ignore_errors=True)
 
 
 def report_lines(report: ParallelReport) -> list[str]:

@@ -109,6 +109,21 @@ def scratch_folder(place: Path | None = None) -> Iterator[Path]:
         remove_folder(Path(folder))
 
 
+@contextmanager
+def claimed(path: Path) -> Iterator[bool]:
+    """Yield whether no other process of this machine is in such a block for `path` as well.
+
+    Two that enter at the same moment may both be told that they are not alone.
+    """
+    own = path.with_name(f"{temporary_prefix(path)}claim")
+    own.touch()
+    try:
+        claims = path.parent.glob(f"{glob.escape(_prefix(path))}*-claim")
+        yield all(claim == own for claim in claims)
+    finally:
+        own.unlink(missing_ok=True)
+
+
 def remove_folder(folder: Path) -> None:
     """Remove a folder of ours, in several tries: a thread of COLMAP's that an interrupted caller
     left at work may write there a last time."""
