@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 import sqlite3
 import subprocess
 import sys
@@ -54,7 +56,8 @@ def test_the_focal_length_is_that_of_the_file_also_where_photos_were_made_smalle
 ) -> None:
     """EXIF's focal plane is that of the photo as it was taken; COLMAP takes it for the file's."""
     resolution = {2: 1016, 3: 400}[unit] * taken // WIDTH
-    plane = {0x920A: IFDRational(5), 0xA20E: IFDRational(resolution), 0xA210: unit, 0xA002: taken}
+    plane = {0x920A: IFDRational(5), 0xA20E: IFDRational(resolution), 0xA210: unit}
+    plane |= {0xA002: taken, 0xA003: taken * HEIGHT // WIDTH}
     images = tmp_path / "images"
     for i in range(2):
         save_jpeg(images / f"{i}.jpg", scene(i), make="Canon", model="S100", detail=plane)
@@ -65,6 +68,43 @@ def test_the_focal_length_is_that_of_the_file_also_where_photos_were_made_smalle
     for one in cameras:
         assert one.has_prior_focal_length
         assert one.mean_focal_length() == pytest.approx(200.0, rel=1e-3)
+
+
+def test_a_photo_that_was_turned_or_cut_keeps_its_focal_length(tmp_path: Path) -> None:
+    plane = {0x920A: IFDRational(5), 0xA20E: IFDRational(1016), 0xA210: 2}
+    plane |= {0xA002: WIDTH, 0xA003: HEIGHT}
+    turned, cut = np.rot90(scene()), scene()[:, : WIDTH // 2]
+    for name, pixels in (("turned.jpg", turned), ("cut.jpg", cut)):
+        pixels = np.ascontiguousarray(pixels)
+        save_jpeg(tmp_path / "images" / name, pixels, make="Canon", model="S100", detail=plane)
+    extract(tmp_path / "images", camera="per-image")
+    with engine.opened(tmp_path / "project.db") as database:
+        for camera in database.read_all_cameras():
+            assert camera.mean_focal_length() == pytest.approx(200.0, rel=1e-3)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems have no such names")
+def test_a_name_that_is_no_text_is_left_out_and_stops_nothing(images: Path) -> None:
+    (images / "2.jpg").rename(images / os.fsdecode(b"Fl\xe4che.jpg"))
+    report = extract(images)
+    assert report.bad == [("Fl?che.jpg", "has a name that is not UTF-8; rename it")]
+    assert (report.photos, report.extracted) == (3, 2)
+
+
+def test_photos_of_another_folder_are_not_imported_beside_the_databases(images: Path) -> None:
+    extract(images)
+    above = images.parent / "above"
+    shutil.copytree(images, above / "images")
+    with pytest.raises(InputError, match="holds none of the database's photos"):
+        extract_features(above, images.parent / "project.db", FeatureOptions(**FEW))
+
+
+def test_new_photos_join_their_camera_though_its_first_photo_is_gone(images: Path) -> None:
+    extract(images)
+    (images / "0.jpg").unlink()
+    save_jpeg(images / "3.jpg", scene(3))
+    extract(images)
+    assert len({row.camera_id for row in rows(images).values()}) == 1
 
 
 def test_sound_photos_of_every_kind_are_imported_and_broken_ones_listed(tmp_path: Path) -> None:

@@ -8,8 +8,8 @@ next one.
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass, field, replace
@@ -138,6 +138,8 @@ def extract_features(
     names = _check_input(images, options)
     engine.check_writable(database)
     rows, with_features, others = _imported(database)
+    check_folder(images, names, [row.name for row in rows])
+    names, unnamed = _with_names(names)
     todo = [name for name in names if name not in with_features]
     if todo and others:
         raise InputError(
@@ -151,7 +153,7 @@ def extract_features(
     with progress.step("Extracting features", sum(len(group.names) for group in groups)) as bar:
         for group in groups:
             _extract_group(images, database, group, options, bar)
-    return _report(database, names, todo, bad)
+    return _report(database, names, todo, bad, unnamed)
 
 
 @dataclass(frozen=True)
@@ -181,6 +183,36 @@ def _check_input(images: Path, options: FeatureOptions) -> list[str]:
             f"There are no photos in {images} ({' '.join(sorted(PHOTO_SUFFIXES))}); mend `images`."
         )
     return names
+
+
+def check_folder(images: Path, there: Collection[str], known: Sequence[str]) -> None:
+    """Make sure that a database's photos are relative to this folder.
+
+    Args:
+        there: photos in the folder.
+        known: the database's.
+
+    Raises:
+        InputError: none of them is there: others would be imported beside them, or they twice.
+    """
+    if known and set(known).isdisjoint(there):
+        raise InputError(
+            f"{images} holds none of the database's photos (first: {known[0]}), and image names "
+            "are relative to one folder: copy the new photos beside the old ones and name that "
+            "folder."
+        )
+
+
+def _with_names(names: Sequence[str]) -> tuple[list[str], list[tuple[str, str]]]:
+    """Return the names that a database can hold; (name, reason) of the others."""
+    held, others = [], []
+    for name in names:
+        shown = name.encode("utf-8", "replace").decode()
+        if shown == name:
+            held.append(name)
+        else:
+            others.append((shown, "has a name that is not UTF-8; rename it"))
+    return held, others
 
 
 def _imported(database: Path) -> tuple[list[ImageRow], set[str], list[str]]:
@@ -267,18 +299,25 @@ def _group(
 
 def _known_cameras(images: Path, rows: Sequence[ImageRow], mode: str) -> dict[CameraKey, ImageRow]:
     """The database's cameras by what their photos have in common; the one most used wins."""
-    uses = Counter(row.camera_id for row in rows)
-    first = {row.camera_id: row for row in reversed(rows)}
+    taken: dict[int, list[ImageRow]] = defaultdict(list)
+    for row in rows:
+        taken[row.camera_id].append(row)
     cameras: dict[CameraKey, ImageRow] = {}
-    for camera_id, _ in uses.most_common():
-        row = first[camera_id]
-        try:
-            header = read_header(images / row.name)
-        except BadPhoto:
-            header = PhotoHeader(row.width, row.height, None)
+    for of_camera in sorted(taken.values(), key=len, reverse=True):
+        # The first may be gone by now.
+        found = ((row, _header(images, row)) for row in of_camera)
+        row, header = next((one for one in found if one[1]), (of_camera[0], None))
+        header = header or PhotoHeader(row.width, row.height, None)
         if (header.width, header.height) == (row.width, row.height):
             cameras.setdefault(CAMERA_MODES[mode](row.name, header), row)
     return cameras
+
+
+def _header(images: Path, row: ImageRow) -> PhotoHeader | None:
+    try:
+        return read_header(images / row.name)
+    except BadPhoto:
+        return None
 
 
 def _extract_group(
@@ -400,7 +439,11 @@ def _scale_space(options: FeatureOptions) -> float:
 
 
 def _report(
-    database: Path, names: Sequence[str], todo: Sequence[str], bad: list[tuple[str, str]]
+    database: Path,
+    names: Sequence[str],
+    todo: Sequence[str],
+    bad: list[tuple[str, str]],
+    unnamed: list[tuple[str, str]],
 ) -> FeatureReport:
     with open_database(database) as colmap:
         ids = {row.name: row.image_id for row in colmap.images()}
@@ -417,10 +460,10 @@ def _report(
     ]
     extracted = [name for name in todo if counts.get(ids.get(name, -1))]
     return FeatureReport(
-        photos=len(names),
+        photos=len(names) + len(unnamed),
         already=len(names) - len(todo),
         extracted=len(extracted),
         features=sum(counts[ids[name]] for name in extracted),
         cameras=cameras,
-        bad=sorted(bad),
+        bad=sorted([*bad, *unnamed]),
     )

@@ -9,12 +9,16 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 
 from colmap_netvlad.cache.ranking import NO_PARTNER, Ranking
 from colmap_netvlad.cache.store import Store
 from colmap_netvlad.colmap.database import image_names, open_database
-from colmap_netvlad.colmap.features import FeatureOptions, FeatureReport, extract_features
+from colmap_netvlad.colmap.features import (
+    FeatureOptions,
+    FeatureReport,
+    check_folder,
+    extract_features,
+)
 from colmap_netvlad.commands.georegister import Placed, keep_place
 from colmap_netvlad.commands.report import (
     PAGE,
@@ -151,7 +155,8 @@ def add_photos(
         model = Path(begun.model)  # the newest model is what the stopped run had made of it
     before = read_model(model)
     check_origin(project, model, before)
-    pending = _unmatched(project.database, before) | set(begun.photos)
+    pending = _unmatched(project.database) | set(begun.photos)
+    pending -= {image.name for image in before.images.values()}
     old = tuple(name for name in image_names(project.database) if name not in pending)
     new = _new_photos(folder, old)
     _remember(project, Begun(new, str(model)))
@@ -305,19 +310,15 @@ def _remember(project: Project, begun: Begun) -> None:
         store.remember(BEGUN_SETTING, json.dumps(asdict(begun)))
 
 
-def _unmatched(database: Path, model: pycolmap.Reconstruction) -> set[str]:
-    """Return the photos that were imported since the model was made: no pair of them was tried."""
+def _unmatched(database: Path) -> set[str]:
+    """Return the photos of which no pair was tried."""
     tried = {name for pair in verified_by_name(database) for name in pair}
-    return set(image_names(database)) - tried - {image.name for image in model.images.values()}
+    return set(image_names(database)) - tried
 
 
 def _new_photos(folder: Path, old: tuple[str, ...]) -> list[str]:
     there = find_photos(folder)
-    if old and not set(there) & set(old):
-        raise InputError(
-            f"{folder} holds none of the database's photos (first: {old[0]}), and image names are "
-            "relative to one folder: copy the new photos beside the old ones and name that folder."
-        )
+    check_folder(folder, there, old)
     new = [name for name in there if name not in set(old)]
     if not new:
         raise InputError(

@@ -24,8 +24,9 @@ from pyproj.transformer import TransformerGroup
 from colmap_netvlad.photos.positions import middle_of
 from colmap_netvlad.runtime.errors import InputError
 
-NEIGHBOUR = 6.0
-"""Degrees beyond a system's area of use in which it is still used: a UTM zone is as wide."""
+NEIGHBOUR = 20.0
+"""Degrees beyond a system's area of use in which it may still be used: Norway is mapped in one UTM
+zone from west to east."""
 
 ORIGIN_DECIMALS = 6
 """The origin is stated to this many decimals of a degree, about 0.1 m, and is exact as stated."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,14 +14,19 @@ from colmap_netvlad.colmap.database import open_database
 from colmap_netvlad.colmap.positions import find_priors
 from colmap_netvlad.geo.frames import LocalFrame, frame_of
 from colmap_netvlad.photos.accuracy import read_deviations
-from colmap_netvlad.photos.positions import place
+from colmap_netvlad.photos.positions import PosePrior, place, read_gps
 from colmap_netvlad.runtime import progress
+
+logger = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 
 DEFAULT_DEVIATIONS = (3.0, 3.0, 5.0)
 """Standard deviations of a position for which none is stated, m east, north, up: a drone's GPS
 without corrections."""
+
+SAME_DEGREES, SAME_HEIGHT = 1e-6, 0.1
+"""Positions of a database and of a photo that are nearer than this, degrees and m, are one."""
 
 HEIGHTS = "as the photos state them; no geoid model is applied"
 """What is said of heights: EXIF means them above sea level, RTK writes them above the ellipsoid,
@@ -121,15 +127,33 @@ def find_deviations(
         return np.tile([stated[0], stated[0], stated[1]], (len(names), 1)), 0
     own = _prior_deviations(database) if database is not None else {}
     if images is not None and images.is_dir():
+        priors = find_priors(names, database, None)
+        moved = []
         with progress.step("Reading accuracy of GPS", len(names)) as bar:
-            for name in names:
-                if name not in own:
-                    stating = read_deviations(images / name)
-                    own |= {} if stating is None else {name: stating}
+            for name, prior in zip(names, priors, strict=True):
+                if name not in own and _differ(prior, read_gps(images / name)):
+                    moved.append(name)
+                elif name not in own and (stating := read_deviations(images / name)):
+                    own[name] = stating
                 bar.advance()
+        if moved:
+            logger.warning(
+                "%d photos state another position than %s (first: %s), which counts, with the "
+                "accuracy of a GPS without corrections; to use what the photos state now, import "
+                "them into a new database.", len(moved), database, moved[0],
+            )  # fmt: skip
     for i, name in enumerate(names):
         deviations[i] = own.get(name, DEFAULT_DEVIATIONS)
     return deviations, sum(name in own for name in names)
+
+
+def _differ(prior: PosePrior | None, photo: PosePrior | None) -> bool:
+    """Whether a database's position is another than the photo's own: that one's accuracy is not
+    the database's."""
+    if prior is None or photo is None or prior.coordinate_system != photo.coordinate_system:
+        return False
+    apart = np.abs(np.subtract(prior.position, photo.position))
+    return bool(apart[:2].max() > SAME_DEGREES or apart[2] > SAME_HEIGHT)
 
 
 def _prior_deviations(database: Path) -> dict[str, tuple[float, float, float]]:

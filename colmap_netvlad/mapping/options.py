@@ -9,6 +9,9 @@ import pycolmap
 from colmap_netvlad.mapping.priors import LOSS_SCALE, PositionPriors
 from colmap_netvlad.runtime.machine import usable_processors
 
+SHARE_OF_SMALL = 0.8
+"""Of a flight of few images a model may have this share, where that is below `min_model_size`."""
+
 
 @dataclass(frozen=True)
 class MappingOptions:
@@ -36,6 +39,10 @@ class MappingOptions:
     cluster_size: int | None = None
     memory: float | None = None
     priors: PositionPriors | None = None
+
+    def least_images(self, images: int) -> int:
+        """Return the images of the smallest model that is kept of so many, as COLMAP counts."""
+        return min(self.min_model_size, max(2, int(SHARE_OF_SMALL * images)))
 
 
 def pipeline_options(

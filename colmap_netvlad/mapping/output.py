@@ -100,20 +100,25 @@ def named(folder: Path) -> Path:
 
 
 def outputs(output: Path) -> list[Path]:
-    """Return `output`, `<output>-2`, `-3`, ... as far as they hold something, the newest last."""
+    """Return those of `output`, `<output>-2`, `-3`, ... that hold something, the newest last."""
     output = named(output)
-    found, candidate = [], output
-    while candidate.exists() and (not candidate.is_dir() or any(candidate.iterdir())):
-        found.append(candidate)
-        candidate = output.with_name(f"{output.name}-{len(found) + 1}")
-    return found
+    candidates = [output, *numbered(output.parent, f"{output.name}-")]
+    return [path for path in candidates if path.exists() and not _is_empty(path)]
+
+
+def _is_empty(path: Path) -> bool:
+    return path.is_dir() and not any(path.iterdir())
 
 
 def free_output(output: Path) -> Path:
     """Return `output`, or `<output>-2`, `-3`, ... where it holds something already.
 
-    A user's models are never replaced: the newest model is the folder with the highest number.
+    A user's models are never replaced: the newest model is the folder with the highest number,
+    also where older ones were removed.
     """
     output = named(output)
-    taken = len(outputs(output))
-    return output.with_name(f"{output.name}-{taken + 1}") if taken else output
+    taken = outputs(output)
+    if not taken:
+        return output
+    last = taken[-1].name.removeprefix(f"{output.name}-")
+    return output.with_name(f"{output.name}-{int(last) + 1 if last.isdecimal() else 2}")

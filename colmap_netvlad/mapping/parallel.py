@@ -364,14 +364,15 @@ def merge_models(
     members: list[list[str]] = []
     refused: list[tuple[str, str]] = []
     joined_later = 0
+    least = options.least_images(cache.num_images())
     for group in sorted(merged, key=lambda group: -len(group.model.poses)):
         refused += group.refused
-        if len(group.model.poses.keys() - have) < options.min_model_size:
+        if len(group.model.poses.keys() - have) < least:
             continue
         reconstruction = rebuild(group.model, cache)
         refine(reconstruction, cache, pipeline, reached)
         registered = set(reconstruction.reg_image_ids())
-        if len(registered - have) < options.min_model_size:
+        if len(registered - have) < least:
             continue
         joined_later += len(registered - group.model.poses.keys())
         have |= registered

@@ -74,7 +74,8 @@ def run_global(advance: Callable[[int], None], request: _Request, folder: Path) 
     options = request.options
     pipeline = pycolmap.GlobalPipelineOptions()
     pipeline.random_seed = options.seed
-    pipeline.min_model_size = options.min_model_size
+    with open_database(request.database) as database:
+        pipeline.min_model_size = options.least_images(len(database.keypoint_counts()))
     pipeline.num_threads = options.threads or usable_processors()
     images = request.images or folder
     _write(pycolmap.global_mapping(request.database, images, folder, options=pipeline), folder)

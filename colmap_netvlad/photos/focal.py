@@ -8,9 +8,12 @@ from pathlib import Path
 from colmap_netvlad.photos.exif import FAULTS, exif_of
 from colmap_netvlad.photos.files import open_header
 
-DETAIL, PIXELS_ACROSS, FOCAL_LENGTH = 0x8769, 0xA002, 0x920A
+DETAIL, FOCAL_LENGTH, PIXELS_ACROSS, PIXELS_DOWN = 0x8769, 0x920A, 0xA002, 0xA003
 PLANE_RESOLUTION, PLANE_UNIT = 0xA20E, 0xA210
 """EXIF tags."""
+
+SAME_SHAPE = 0.02
+"""Photos whose ratios of sides are nearer than this have one shape: sides are whole."""
 
 UNITS = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 """EXIF's number of a unit of resolution: mm."""
@@ -33,10 +36,13 @@ def plane_focal(photo: Path) -> PlaneFocal | None:
     """Return a photo's focal length by its focal plane, or None where EXIF does not state it."""
     try:
         with open_header(photo) as image:
-            detail, across = exif_of(image).get_ifd(DETAIL), image.width
+            detail, stored = exif_of(image).get_ifd(DETAIL), sorted(image.size)
         unit = UNITS[int(detail.get(PLANE_UNIT, 2))]
         taken = float(detail[FOCAL_LENGTH]) * float(detail[PLANE_RESOLUTION]) / unit
-        share = across / int(detail[PIXELS_ACROSS])
+        sides = sorted((int(detail[PIXELS_ACROSS]), int(detail[PIXELS_DOWN])))
+        shares = [side / of_taken for side, of_taken in zip(stored, sides, strict=True)]
     except FAULTS:
         return None
-    return PlaneFocal(taken, share * taken) if taken > 0 and 0 < share <= 1 else None
+    # Sides that shrank unequally are those of a part of the photo, which has its focal length.
+    made_smaller = shares[1] <= 1 and abs(shares[0] / shares[1] - 1) < SAME_SHAPE
+    return PlaneFocal(taken, shares[1] * taken) if taken > 0 and made_smaller else None
