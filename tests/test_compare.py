@@ -225,6 +225,19 @@ def test_a_run_killed_while_mapping_keeps_the_models_it_has(
     assert timeless(again) == timeless(whole[0])
 
 
+def test_methods_are_added_though_the_photos_are_elsewhere_by_now(
+    no_page, project_copy: Make, tiny_checkpoint
+):
+    project = project_copy(copy_photos=True)
+    first, _ = compare(project, [str(tiny_checkpoint)], FAST)
+    project.need_images().rename(project.folder / "elsewhere")
+    later, _ = compare(project, ["random"], FAST)
+    before, after = (comparison.methods[0] for comparison in (first, later))
+    assert [figures.pairs for figures in after.at_k] == [f.pairs for f in before.at_k]
+    assert not later.incomplete
+    assert "the photos are not at hand: as ranked before" in after.notes
+
+
 def test_methods_are_added_to_an_earlier_comparison(no_page, project_copy: Make, monkeypatch):
     project = project_copy()
     compare(project, ["vlad"], FAST)

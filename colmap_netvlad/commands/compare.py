@@ -266,8 +266,12 @@ def _rank(
     count = len(flight.names)
     depth = count - 1 if count <= FULL_RANKING else ks[-1]
     try:
-        retrieval = _concerning(find_method(candidate.text), options, depth)
-        key = _ranking_key(candidate.text, flight, retrieval)
+        method = find_method(candidate.text)
+        retrieval = _concerning(method, options, depth)
+        column, folder = f"{candidate.text}-k{depth}", flight.project.images
+        at_hand = method.model is None or (folder is not None and folder.is_dir())
+        key = None if at_hand else workspace.latest_key(column)
+        key = key or _ranking_key(candidate.text, flight, retrieval)
         kept = workspace.load_ranking(key)
         if kept is None:
             logger.info("Ranking by %s", candidate.name)
@@ -276,7 +280,11 @@ def _rank(
             seen = time.perf_counter() - start
             kept = ranking, metrics.efficiency(ranking) > STOLEN_TIME * seen
             workspace.save_ranking(key, *kept)
+        workspace.keep_latest_key(column, key)
         candidate.ranking, candidate.timed_earlier = kept
+        if not at_hand:
+            notes = (*candidate.ranking.notes, "the photos are not at hand: as ranked before")
+            candidate.ranking = replace(candidate.ranking, notes=notes)
     except Exception as fault:  # whatever stops one method leaves the others
         candidate.failed = _reason(fault)
 

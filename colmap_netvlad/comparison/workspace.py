@@ -165,6 +165,18 @@ class Workspace:
                 timed_earlier=timed_earlier,
             )
 
+    def latest_key(self, column: str) -> str | None:
+        """Return the key of the ranking that a column had last; None where it had none."""
+        path = self._latest_path(column)
+        return path.read_text(encoding="utf-8") if path.is_file() else None
+
+    def keep_latest_key(self, column: str, key: str) -> None:
+        """Keep the key of the ranking that a column has."""
+        write_atomically(self._latest_path(column), key)
+
+    def _latest_path(self, column: str) -> Path:
+        return self._work / "rankings" / f"{file_name(column)}.key"
+
     def _ranking_path(self, key: str) -> Path:
         return self._work / "rankings" / f"{file_name(key)}.npz"
 
