@@ -21,12 +21,14 @@ from colmap_netvlad.cli import cli
 from colmap_netvlad.colmap import engine
 from colmap_netvlad.colmap.database import image_names, open_database, pair_id
 from colmap_netvlad.commands import reconstruct as command
+from colmap_netvlad.commands.georegister import database_beside
 from colmap_netvlad.commands.match import MatchingReport, working_copy
 from colmap_netvlad.commands.reconstruct import (
     ReconstructReport,
     reconstruct,
     report_lines,
 )
+from colmap_netvlad.commands.report import report
 from colmap_netvlad.mapping.incremental import map_incremental
 from colmap_netvlad.mapping.output import free_output
 from colmap_netvlad.mapping.summary import ModelSummary, combine, registered_names, summarize
@@ -122,6 +124,10 @@ def test_copy_leaves_the_database_byte_identical(project_copy: MakeProject) -> N
     assert (project.sparse / "0").is_dir() and "66 now" in result.stdout
     again = CliRunner().invoke(cli, arguments)
     assert "66 matched before" in again.stdout and "sparse-2" in again.stdout
+    # What asks for the model's database later finds the copy, which has its matches.
+    assert database_beside(project.sparse, None)[0] == project.copy
+    (links,) = (check for check in report(project.sparse).checks if check.title == "Weak links")
+    assert (links.value, links.level) == ("none", "green")
 
 
 def test_a_copy_of_other_features_is_made_anew(project_copy: MakeProject) -> None:

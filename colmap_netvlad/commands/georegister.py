@@ -23,6 +23,7 @@ from colmap_netvlad.geo.gcp import (
 )
 from colmap_netvlad.geo.georeference import Georeference, read_place, transformed
 from colmap_netvlad.geo.places import Places, find_places
+from colmap_netvlad.graph.verified import with_matches
 from colmap_netvlad.mapping.merge import Refused, read_sub_model, shared_points, similarity
 from colmap_netvlad.mapping.output import free_output, model_folder, named, numbered
 from colmap_netvlad.mapping.summary import of_database, put_aside
@@ -305,6 +306,7 @@ def database_beside(sparse: Path, given: Path | None) -> tuple[Path | None, list
         return given, []
     if not of_database(read_model(find_models(sparse)[0]), found):
         return None, [put_aside(found)]
+    found = with_matches(found)
     return found, [f"Database, found beside the model: {found}."]
 
 

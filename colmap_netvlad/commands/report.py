@@ -18,6 +18,7 @@ from colmap_netvlad.colmap.database import image_names, open_database
 from colmap_netvlad.colmap.positions import find_priors
 from colmap_netvlad.geo.georeference import FILE as GEOREFERENCE
 from colmap_netvlad.graph.lookalikes import Moves
+from colmap_netvlad.graph.verified import with_matches
 from colmap_netvlad.mapping.extend import largest_model, read_model
 from colmap_netvlad.mapping.output import numbered, outputs
 from colmap_netvlad.mapping.summary import of_database, put_aside
@@ -104,6 +105,8 @@ def report(
         if database is not None and model.num_images() and not of_database(model, database):
             logger.warning(put_aside(database))
             database = None
+        if database is not None:
+            database = with_matches(database)
     elif not _same_photos(model, database):
         raise InputError(
             f"{database} has none of the photos of {folder}: it is another project's; mend "

@@ -8,6 +8,7 @@ from pathlib import Path
 from colmap_netvlad.colmap.database import image_names, open_database
 from colmap_netvlad.graph.components import component_names
 from colmap_netvlad.graph.pair import Pair, as_pair
+from colmap_netvlad.project import Project
 
 
 def verified_components(database: Path) -> list[list[str]]:
@@ -31,6 +32,18 @@ def verified_by_name(database: Path) -> dict[Pair, int]:
         names = {row.image_id: row.name for row in opened.images()}
         counts = opened.verified_matches()
     return {as_pair(names[a], names[b]): count for (a, b), count in counts.items()}
+
+
+def with_matches(database: Path) -> Path:
+    """Return the copy that `--copy` made of a database, where that alone has verified pairs.
+
+    Raises:
+        InputError: either cannot be read.
+    """
+    copy = Project(database, None).copy
+    if copy.is_file() and not verified_by_name(database) and verified_by_name(copy):
+        return copy
+    return database
 
 
 def mapped_names(database: Path, but: Collection[Pair] = ()) -> set[str]:

@@ -397,6 +397,12 @@ def _points(quality: Quality) -> Check:
 def _links(quality: Quality) -> Check:
     title = "Weak links"
     images, bridges = quality.links.articulation_images, quality.links.bridges
+    if (parts := len(quality.links.component_sizes)) > 1:
+        return Check(
+            title, f"{parts:,} parts", "yellow",
+            "No verified pair joins these parts of the model: the database's matches are not those "
+            "that it was made from, or it hangs together by points alone.",
+        )  # fmt: skip
     if not images and not bridges:
         return Check(title, "none", "green", "No single photo or pair holds the model together.")
     value = f"{len(images):,} photo{_s(len(images))}, {len(bridges):,} pair{_s(len(bridges))}"
