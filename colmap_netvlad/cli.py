@@ -230,12 +230,7 @@ def pairs(
         print_json(as_dictionary(report))
     else:
         say(*summary(project, report))
-    finish_partial(
-        [
-            *(f"Left out: {name} {reason}" for name, reason in report.ranking.left_out),
-            *(f"Ranked without the photo: {name} {why}" for name, why in report.ranking.unseen),
-        ]
-    )
+    finish_partial(report.ranking.left_out_lines())
 
 
 @cli.command()

@@ -233,9 +233,7 @@ def _new_bars() -> Progress:
 
 def print_models(report: ReconstructReport) -> None:
     """Print the figures of all models on standard output."""
-    from rich.console import Console
-
-    Console().print(models_table(report))
+    _print_whole(models_table(report))
 
 
 def models_table(report: ReconstructReport) -> Table:
@@ -299,11 +297,15 @@ def summary_table(comparison: Comparison) -> Table:
 
 
 def print_comparison(comparison: Comparison, console: Console | None = None) -> None:
-    """Print the summary on standard output, whole also where the terminal is narrow."""
+    """Print the summary on standard output."""
+    _print_whole(summary_table(comparison), console)
+
+
+def _print_whole(table: Table, console: Console | None = None) -> None:
+    """Print a table whole, also where the terminal is narrow."""
     from rich.console import Console
 
     console = console or Console()
-    table = summary_table(comparison)
     needed = Console(width=WIDEST).measure(table).maximum
     if needed > console.width:
         console = Console(file=console.file, width=needed, force_terminal=console.is_terminal)

@@ -147,7 +147,7 @@ def test_new_and_changed_photos_alone_are_computed(
 
 
 def test_bad_photos_are_left_out_with_a_reason_and_stop_nothing(
-    project_copy: MakeProject, checkpoint: Path
+    project_copy: MakeProject, checkpoint: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     project = project_copy(copy_photos=True)
     assert project.images is not None
@@ -161,6 +161,8 @@ def test_bad_photos_are_left_out_with_a_reason_and_stop_nothing(
     assert all(dict(ranking.left_out).values())
     assert ranking.partners.shape == (12, 8)
     assert not np.isin(ranking.partners[3:], [0, 1, 2]).any()
+    # The commands that rank without a list of their own say it as well.
+    assert ranking.left_out_lines() == caplog.messages
 
 
 @pytest.mark.parametrize("others", [False, True])

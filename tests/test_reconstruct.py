@@ -36,7 +36,7 @@ from colmap_netvlad.matching.options import MatchReport
 from colmap_netvlad.matching.run import match_pairs
 from colmap_netvlad.project import Project
 from colmap_netvlad.runtime.errors import InputError
-from colmap_netvlad.terminal import models_table
+from colmap_netvlad.terminal import models_table, print_models
 
 MakeProject = Callable[..., Project]
 
@@ -290,7 +290,9 @@ def test_summaries_count_an_image_of_two_models_once(project_copy: MakeProject) 
     assert combine([]).registered == 0
 
 
-def test_the_report_shows_each_component_and_the_total(tmp_path: Path) -> None:
+def test_the_report_shows_each_component_and_the_total(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     model = ModelSummary(5, 1000, 0.5, 3.0, 3000)
     matched = MatchReport(requested=66, already=66, matched=0, verified=50, seconds=0.0)
     report = ReconstructReport(
@@ -304,6 +306,10 @@ def test_the_report_shows_each_component_and_the_total(tmp_path: Path) -> None:
     )
     assert models_table(report).row_count == 1
     assert models_table(replace(report, models=[model, model])).row_count == 3
+    monkeypatch.setenv("COLUMNS", "60")
+    print_models(replace(report, models=[model, model]))
+    said = capsys.readouterr().out
+    assert "Component" in said and "total" in said and "…" not in said
     text = "\n".join(report_lines(report))
     assert "15 of 20 images: 0.jpg" in text and "9.jpg, and 5 more." in text
     assert "10.jpg" not in text

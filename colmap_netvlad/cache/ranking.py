@@ -59,6 +59,13 @@ class Ranking:
         """Names of the images that have no cells of now: those left out, and those unseen."""
         return frozenset(name for name, _ in (*self.left_out, *self.unseen))
 
+    def left_out_lines(self) -> list[str]:
+        """Return one line for each photo that could not be used, or not seen."""
+        return [
+            *(f"Left out: {name} {reason}" for name, reason in self.left_out),
+            *(f"Ranked without the photo: {name} {reason}" for name, reason in self.unseen),
+        ]
+
     def with_unseen(self, bad: Mapping[str, str]) -> Ranking:
         """Return the ranking with the photos that could not be described (name -> reason): those
         that are not left out are `unseen`."""

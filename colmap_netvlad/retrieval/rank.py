@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,6 +25,8 @@ from colmap_netvlad.retrieval.options import (
 )
 from colmap_netvlad.retrieval.rerank import rerank
 from colmap_netvlad.runtime.errors import InputError
+
+logger = logging.getLogger(__name__)
 
 DEFAULT_OPTIONS = RetrievalOptions()
 
@@ -96,9 +99,12 @@ def rank_project(
     options: RetrievalOptions = DEFAULT_OPTIONS,
     least_depth: int = 0,
 ) -> Ranking:
-    """Open a project and `rank` its images."""
+    """Open a project and `rank` its images; photos that cannot be used are logged."""
     with open_flight(project) as flight:
-        return rank(flight, name, options, least_depth)
+        ranking = rank(flight, name, options, least_depth)
+    for line in ranking.left_out_lines():
+        logger.warning(line)
+    return ranking
 
 
 def check_exports(name: str | Path, options: RetrievalOptions) -> str | Path:
