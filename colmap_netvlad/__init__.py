@@ -2,9 +2,10 @@
 
     import colmap_netvlad as cn
 
-    project = cn.open_project("project.db", images="photos")
-    pairs = cn.make_pairs(project, k=30)
-    model = cn.reconstruct(project, pairs)
+    if __name__ == "__main__":  # processes that share the work import a script again
+        project = cn.open_project("project.db", images="photos")
+        pairs = cn.make_pairs(project, k=30)
+        model = cn.reconstruct(project, pairs)
 
 Each name below is one step; nothing is imported before it is used.
 """

@@ -79,7 +79,7 @@ masks_option = click.option(
 pairs_option = click.option(
     "--pairs",
     type=PATH,
-    help="Pairs list (COLMAP's, .csv or .json).  [default: pairs.txt beside the database]",
+    help="Pairs list (COLMAP's, .csv or .json).  [default: what `pairs` wrote last]",
 )
 sparse_option = click.option(
     "--sparse", type=PATH, required=True, help="A COLMAP model, or a folder of models 0, 1, ..."

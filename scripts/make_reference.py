@@ -48,13 +48,15 @@ PYTHON_HEAD = """\
 ```python
 import colmap_netvlad as cn
 
-project = cn.open_project("project.db", images="photos")
-pairs = cn.make_pairs(project, k=30)
-model = cn.reconstruct(project, pairs)
-page = cn.compare(project, methods=["bow", "vlad", "netvlad-o-lite"], k=[10, 20])
+if __name__ == "__main__":
+    project = cn.open_project("project.db", images="photos")
+    pairs = cn.make_pairs(project, k=30)
+    model = cn.reconstruct(project, pairs)
+    page = cn.compare(project, methods=["bow", "vlad", "netvlad-o-lite"], k=[10, 20])
 ```
 
-Each command is one function. They raise `InputError` with one sentence where something in the
+The line with `__main__` is needed in a script: processes that share the work import the file again, and would
+begin it anew without. Each command is one function. They raise `InputError` with one sentence where something in the
 input is wrong, log through `logging`, and print nothing. Importing before or after pycolmap makes
 no difference. A walk through them on a rendered flight: `examples/walkthrough.py`. What is not
 shown here is not promised to stay. (On a repository page only names show; the site has the

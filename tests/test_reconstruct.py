@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import os
 import shutil
 import sqlite3
 from collections.abc import Callable
@@ -22,7 +23,7 @@ from colmap_netvlad.colmap import engine
 from colmap_netvlad.colmap.database import image_names, open_database, pair_id
 from colmap_netvlad.commands import reconstruct as command
 from colmap_netvlad.commands.georegister import database_beside
-from colmap_netvlad.commands.match import MatchingReport, working_copy
+from colmap_netvlad.commands.match import MatchingReport, match, working_copy
 from colmap_netvlad.commands.reconstruct import (
     ReconstructReport,
     reconstruct,
@@ -34,6 +35,8 @@ from colmap_netvlad.mapping.output import free_output
 from colmap_netvlad.mapping.summary import ModelSummary, combine, registered_names, summarize
 from colmap_netvlad.matching.options import MatchReport
 from colmap_netvlad.matching.run import match_pairs
+from colmap_netvlad.pairs.lists import write_pairs
+from colmap_netvlad.pairs.union import ImagePair
 from colmap_netvlad.project import Project
 from colmap_netvlad.runtime.errors import InputError
 from colmap_netvlad.terminal import models_table, print_models
@@ -111,6 +114,19 @@ def test_map_without_photos_works_on_the_database_alone(
     models = map_incremental(project_copy(matched=True).database, None, tmp_path / "out" / "sparse")
     assert sum(model.num_reg_images() for model in models) == 12
     assert (tmp_path / "out" / "sparse" / "0" / "images.bin").is_file()
+
+
+def test_the_list_that_was_written_last_is_matched(project_copy: MakeProject) -> None:
+    """Where names do not fit in COLMAP's list, `pairs` writes the complete one after it."""
+    project = project_copy()
+    a, b, c = image_names(project.database)[:3]
+    project.pairs.write_text(f"{a} {b}\n", encoding="utf-8")
+    os.utime(project.pairs, ns=(1, 1))
+    listed = [ImagePair(a, b, 0.9, 1), ImagePair(b, c, 0.8, 1)]
+    write_pairs(project.pairs.with_suffix(".csv"), listed, "csv")
+    assert match(project).matches.requested == 2
+    os.utime(project.pairs)
+    assert match(project).matches.requested == 1
 
 
 def test_copy_leaves_the_database_byte_identical(project_copy: MakeProject) -> None:

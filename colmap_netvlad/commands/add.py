@@ -319,7 +319,8 @@ def _unmatched(database: Path) -> set[str]:
 def _new_photos(folder: Path, old: tuple[str, ...]) -> list[str]:
     there = find_photos(folder)
     check_folder(folder, there, old)
-    new = [name for name in there if name not in set(old)]
+    known = set(old)
+    new = [name for name in there if name not in known]
     if not new:
         raise InputError(
             f"There are no new photos in {folder}: the database has all {len(there)} of them, and "

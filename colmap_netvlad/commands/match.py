@@ -21,7 +21,7 @@ from colmap_netvlad.matching.rounds import (
 )
 from colmap_netvlad.matching.run import match_pairs
 from colmap_netvlad.pairs.connect import apart_lines
-from colmap_netvlad.pairs.lists import read_pairs
+from colmap_netvlad.pairs.lists import SUFFIXES, read_pairs
 from colmap_netvlad.project import Project
 from colmap_netvlad.retrieval.options import RetrievalOptions
 from colmap_netvlad.retrieval.rank import rank_project
@@ -141,16 +141,24 @@ def _chosen(project: Project, pairs: PairsOrList) -> list[Pair]:
         return [(pair.name1, pair.name2) for pair in pairs.pairs]
     if pairs is not None and not isinstance(pairs, str | Path):
         return list(pairs)
-    listed = project.pairs if pairs is None else Path(pairs)
+    listed = _newest_list(project) if pairs is None else Path(pairs)
     if not listed.is_file():
         raise InputError(
-            f"There is no pairs list {listed}; make it with `colmap-netvlad pairs`, or name one "
-            "with `pairs`."
+            f"There is no pairs list {listed}; make it with `colmap-netvlad pairs`, name one with "
+            "`pairs`, or match in `rounds`, which need none."
         )
     chosen = read_pairs(listed, image_names(project.database))
     if not chosen:
         raise InputError(f"{listed} lists no pairs; run `colmap-netvlad pairs`.")
     return chosen
+
+
+def _newest_list(project: Project) -> Path:
+    """Return the list that `pairs` wrote last: COLMAP's, or the complete one where names do not fit
+    in that."""
+    lists = [project.pairs.with_suffix(suffix) for suffix in SUFFIXES.values()]
+    written = [path for path in lists if path.is_file()]
+    return max(written, key=lambda path: path.stat().st_mtime_ns, default=project.pairs)
 
 
 def _spend(project: Project, rounds: RoundsOptions, options: MatchOptions) -> RoundsReport:
