@@ -55,12 +55,12 @@ if __name__ == "__main__":
     page = cn.compare(project, methods=["bow", "vlad", "netvlad-o-lite"], k=[10, 20])
 ```
 
-The line with `__main__` is needed in a script: processes that share the work import the file again, and would
-begin it anew without. Each command is one function. They raise `InputError` with one sentence where something in the
-input is wrong, log through `logging`, and print nothing. Importing before or after pycolmap makes
-no difference. A walk through them on a rendered flight: `examples/walkthrough.py`. What is not
-shown here is not promised to stay. (On a repository page only names show; the site has the
-docstrings.)
+The line with `__main__` is needed in a script: processes that share the work import the file again,
+and would begin it anew without. Each command is one function. They raise `InputError` with one
+sentence where something in the input is wrong, log through `logging`, and print nothing. Importing
+before or after pycolmap makes no difference. A walk through them on a rendered flight:
+`examples/walkthrough.py`. What is not shown here is not promised to stay. (On a repository page
+only names show; the site has the docstrings.)
 """
 
 
