@@ -36,7 +36,7 @@ from colmap_netvlad.graph.verified import verified_by_name
 from colmap_netvlad.mapping.contradicted import dropped_lines, mapping_database, moves_of
 from colmap_netvlad.mapping.extend import check_origin, extend_model, largest_model, read_model
 from colmap_netvlad.mapping.options import MappingOptions
-from colmap_netvlad.mapping.output import free_output, numbered, take_name
+from colmap_netvlad.mapping.output import free_output, numbered, outputs, take_name
 from colmap_netvlad.mapping.priors import PositionPriors
 from colmap_netvlad.mapping.summary import ModelSummary, registered_names, summarize
 from colmap_netvlad.matching.options import MatchOptions, MatchReport, given_up_words
@@ -272,8 +272,7 @@ def newest_model(project: Project) -> Path:
     Raises:
         InputError: there is none.
     """
-    again = numbered(project.folder, f"{project.sparse.name}-")
-    for folder in (*reversed(again), project.sparse):
+    for folder in reversed(outputs(project.sparse)):
         if models := numbered(folder):
             return largest_model(models)
     raise InputError(

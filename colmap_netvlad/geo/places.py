@@ -131,10 +131,12 @@ def find_deviations(
         moved = []
         with progress.step("Reading accuracy of GPS", len(names)) as bar:
             for name, prior in zip(names, priors, strict=True):
-                if name not in own and _differ(prior, read_gps(images / name)):
-                    moved.append(name)
-                elif name not in own and (stating := read_deviations(images / name)):
-                    own[name] = stating
+                photo = images / name
+                if name not in own:
+                    if prior is not None and _differ(prior, read_gps(photo)):
+                        moved.append(name)
+                    elif stating := read_deviations(photo):
+                        own[name] = stating
                 bar.advance()
         if moved:
             logger.warning(
@@ -147,10 +149,10 @@ def find_deviations(
     return deviations, sum(name in own for name in names)
 
 
-def _differ(prior: PosePrior | None, photo: PosePrior | None) -> bool:
+def _differ(prior: PosePrior, photo: PosePrior | None) -> bool:
     """Whether a database's position is another than the photo's own: that one's accuracy is not
     the database's."""
-    if prior is None or photo is None or prior.coordinate_system != photo.coordinate_system:
+    if photo is None or prior.coordinate_system != photo.coordinate_system:
         return False
     apart = np.abs(np.subtract(prior.position, photo.position))
     return bool(apart[:2].max() > SAME_DEGREES or apart[2] > SAME_HEIGHT)

@@ -13,6 +13,9 @@ from PIL.PngImagePlugin import PngImageFile
 TAIL_BYTES = 128 * 1024
 """EXIF behind a PNG's pixels begins within these: its chunk is 64 KiB at most in what writes it."""
 
+DETAIL = 0x8769
+"""The tag of EXIF's own directory."""
+
 FAULTS = (KeyError, TypeError, ValueError, ArithmeticError, OSError, SyntaxError, struct.error)
 """What reading a tag raises where it is missing or broken, or the file cannot be opened: the pixels
 may well be whole."""

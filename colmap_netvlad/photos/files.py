@@ -15,7 +15,7 @@ from typing import BinaryIO
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 
-from colmap_netvlad.photos.exif import FAULTS, exif_of
+from colmap_netvlad.photos.exif import DETAIL, FAULTS, exif_of
 from colmap_netvlad.photos.xmp import properties
 
 PHOTO_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"})
@@ -318,7 +318,7 @@ def _orientation(photo: Image.Image) -> int:
 def _detail(photo: Image.Image, tag: int) -> str | None:
     """Return a text of EXIF's own directory, or None where it is missing or broken."""
     try:
-        value = exif_of(photo).get_ifd(0x8769).get(tag)
+        value = exif_of(photo).get_ifd(DETAIL).get(tag)
     except FAULTS:
         return None
     return str(value).strip("\0 ") if value is not None else None
@@ -327,7 +327,7 @@ def _detail(photo: Image.Image, tag: int) -> str | None:
 def _lens(photo: Image.Image) -> tuple[str, str, float] | None:
     try:
         exif = exif_of(photo)
-        detail = exif.get_ifd(0x8769)
+        detail = exif.get_ifd(DETAIL)
         make, model = str(exif[0x010F]).strip("\0 "), str(exif[0x0110]).strip("\0 ")
         # As COLMAP: the focal length in 35 mm film where given, else the real one.
         focal = float(detail[0xA405] if 0xA405 in detail else detail[0x920A])

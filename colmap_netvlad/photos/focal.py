@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from colmap_netvlad.photos.exif import FAULTS, exif_of
+from colmap_netvlad.photos.exif import DETAIL, FAULTS, exif_of
 from colmap_netvlad.photos.files import open_header
 
-DETAIL, FOCAL_LENGTH, PIXELS_ACROSS, PIXELS_DOWN = 0x8769, 0x920A, 0xA002, 0xA003
+FOCAL_LENGTH, PIXELS_ACROSS, PIXELS_DOWN = 0x920A, 0xA002, 0xA003
 PLANE_RESOLUTION, PLANE_UNIT = 0xA20E, 0xA210
 """EXIF tags."""
 

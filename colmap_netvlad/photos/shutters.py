@@ -17,7 +17,7 @@ from statistics import median
 
 import numpy as np
 
-from colmap_netvlad.photos.exif import FAULTS, exif_of
+from colmap_netvlad.photos.exif import DETAIL, FAULTS, exif_of
 from colmap_netvlad.photos.files import BadPhoto, open_header, photo_path
 from colmap_netvlad.photos.positions import read_gps
 from colmap_netvlad.photos.xmp import properties
@@ -152,7 +152,7 @@ def _read(images: Path, name: str, number: int) -> _Taken | None:
         with open_header(path) as photo:
             exif, xmp = exif_of(photo), properties(photo)
             model = str(exif.get(0x0110, "")).strip("\0 ")
-            detail = exif.get_ifd(0x8769)
+            detail = exif.get_ifd(DETAIL)
             large = photo.width * photo.height > LARGE
     except (BadPhoto, *FAULTS):
         return None

@@ -65,11 +65,12 @@ def candidates(
     notes = [note, *_mask_notes(options.masks, flight.names)]
     known = flight.store, key, flight.names, left_out, options, depth, method, notes
     if serves(options, len(flight.names) - len(left_out)):
-        return combine([*rank_in_words(*known), *beside], method, depth).with_unseen(left_out)
-    alone = rank_described(*known)
-    if not beside:
-        return alone
-    return combine([(alone, 1.0), *beside], method, depth).with_unseen(left_out)
+        ranking = combine([*rank_in_words(*known), *beside], method, depth)
+    elif beside:
+        ranking = combine([(rank_described(*known), 1.0), *beside], method, depth)
+    else:
+        ranking = rank_described(*known)
+    return ranking.with_unseen(left_out)
 
 
 def describe_photos(
